@@ -5,9 +5,9 @@
     python -m benchmarks.guard --slow "match a drive" 1.25 --repeats 20
 
 Instructions are counted by valgrind (:mod:`benchmarks.instructions`): other work on the machine does not
-count. Where there is no valgrind, nothing is measured, and that is said. ``--renew`` writes what is found as
-expected, after a change that is meant to cost; the versions it was measured with stand beside it. ``--slow``
-makes a path cost more, to see that it is found.
+count. Where there is no valgrind, nothing is measured: that is said on stderr, and is a failure with
+``--required``. ``--renew`` writes what is found as expected, after a change that is meant to cost; beside it
+stand the versions it was measured with. ``--slow`` makes a path cost more, to see that it is found.
 """
 
 from __future__ import annotations
@@ -135,6 +135,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("--required", action="store_true", help="fail where nothing can be counted")
     parser.add_argument("--renew", action="store_true", help="write what is found as expected")
     parser.add_argument("--repeats", type=int, default=1, help="how often to count everything")
     parser.add_argument("--slow", nargs=2, action="append", default=[], metavar=("NAME", "FACTOR"))
@@ -145,7 +146,9 @@ def main() -> None:
         return
     reason = missing()
     if reason is not None:
-        print(f"guard: skipped, {reason}")
+        print(f"guard: NOTHING WAS CHECKED: {reason}", file=sys.stderr)
+        if args.required:
+            sys.exit(1)
         return
     inputs, slowed = Inputs.of(), {name: float(factor) for name, factor in args.slow}
     if args.renew:

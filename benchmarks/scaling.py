@@ -4,11 +4,17 @@
     OMP_NUM_THREADS=1 python -m benchmarks.scaling --only frames --frames 25 50 100 200 400 --out out/scaling
 
 Simulated streets are written to a temporary folder, and each calibration is a process of its own, whose
-processor seconds and largest resident memory count. ``prepare`` reads the frames and keeps their features,
-``solve`` is everything after it. OUT gets scaling.md, a table for each question with log-log slopes (of all
-sizes, by least squares, and between the last two), and scaling.svg (extra ``plot``). Work that does not grow
-flattens the slope of small sizes; the last two say more about larger ones. A rig has the same camera several
-times: for the cost that makes no difference.
+processor seconds and largest resident memory count. ``prepare`` reads the frames and keeps their features;
+``12 iterations`` is the same work at every size: as many outer iterations (match, build, solve) from the true
+extrinsic. ``--whole`` adds ``whole estimate``, what ``calibrate`` does after prepare from the nominal
+extrinsic, without the search for causes: how many searches and tests it makes depends on what it finds, and
+its status stands beside it. OUT gets scaling.md, a table for each question with log-log slopes (of all sizes,
+by least squares, and between the last two), and scaling.svg (extra ``plot``). Work that does not grow makes
+the slope of small sizes flatter; the last two say more about larger ones.
+
+Frames are those of a street of 41, played forth and back under rising stamps (a drive reversed in time is a
+drive), so that one is like another. Points are varied by the angle between two firings, on a street full of
+trucks. A rig has the same camera several times: for the cost that makes no difference.
 """
 
 from __future__ import annotations
@@ -19,23 +25,32 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph import CalibrationConfig, open_source
 from sst_graph.batch.calibrate import calibrate_prepared, prepare_drives
+from sst_graph.batch.problem import CalibrationProblem
+from sst_graph.drive.preparation import Drive
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.graph.outer_loop import solve_joint
+from sst_graph.graph.state import State
 from sst_graph.rig.calibrate import Guess, KnownRig, calibrate_rig_prepared, prepare_rig
 from sst_graph.simulator import SimulationConfig, simulate, write_drive
-from sst_graph.types import SemanticClass
+from sst_graph.types import CameraImage, Frame, GroundTruth, Scan, SemanticClass
 
-COSTS = "prepare [s]", "solve [s]", "peak memory [MB]"
-STREET = SimulationConfig(seed=5, frames=20, width=621, height=188, azimuth_limit_deg=60.0)
+COSTS, WHOLE = ("prepare [s]", "12 iterations [s]", "peak memory [MB]"), "whole estimate [s]"
+ITERATIONS, FRAMES, STREET_FRAMES, PERIOD_NS = 12, 6, 41, 100_000_000
+STREET = SimulationConfig(
+    seed=5, frames=FRAMES, width=621, height=188, azimuth_limit_deg=60.0, time_offset_s=0.0
+)
 FloatArray = NDArray[np.float64]
 
 
@@ -46,24 +61,36 @@ class Series:
     Attributes:
         unknown: what is varied.
         sizes: (k,) of it.
-        costs: (k, 3) as :data:`COSTS`.
+        costs: (k, 3) as :data:`COSTS`, or (k, 4) with that of :data:`WHOLE`.
+        statuses: k of the whole estimates, empty without.
     """
 
     unknown: str
     sizes: FloatArray
     costs: FloatArray
+    statuses: list[str]
+
+    @classmethod
+    def of(cls, unknown: str, sizes: Sequence[float], found: Sequence[dict[str, Any]]) -> Series:
+        names = ["prepare", "solve", "peak_mb", *(["estimate"] if found[0]["status"] else [])]
+        costs = np.array([[one[name] for name in names] for one in found])
+        return cls(unknown, np.array(sizes, float), costs, [one["status"] for one in found])
 
     def slopes(self) -> tuple[FloatArray, FloatArray]:
-        """(3,) of all sizes, and (3,) between the last two."""
+        """(3 or 4,) of all sizes, and between the last two."""
         x, y = np.log(self.sizes), np.log(self.costs)
-        return np.polyfit(x, y, 1)[0], (y[-1] - y[-2]) / (x[-1] - x[-2])
+        return np.array([np.polyfit(x, cost, 1)[0] for cost in y.T]), (y[-1] - y[-2]) / (x[-1] - x[-2])
 
     def table(self) -> str:
-        lines = [f"| {self.unknown} | {' | '.join(COSTS)} |", "|---|---|---|---|"]
-        for size, (prepare, solve, memory) in zip(self.sizes, self.costs, strict=True):
-            lines.append(f"| {size:,.0f} | {prepare:.2f} | {solve:.2f} | {memory:.0f} |")
+        whole = any(self.statuses)
+        heads = [*COSTS, *([WHOLE, "status"] if whole else [])]
+        lines = [f"| {self.unknown} | {' | '.join(heads)} |", "|---" * (1 + len(heads)) + "|"]
+        for size, cost, status in zip(self.sizes, self.costs, self.statuses, strict=True):
+            cells = [f"{one:.0f}" if one > 100.0 else f"{one:.2f}" for one in cost]
+            lines.append(f"| {size:,.0f} | {' | '.join([*cells, *([status] if whole else [])])} |")
         for name, slopes in zip(("slope", "slope of the last two"), self.slopes(), strict=True):
-            lines.append(f"| {name} | {' | '.join(f'{slope:.2f}' for slope in slopes)} |")
+            cells = [f"{slope:.2f}" for slope in slopes]
+            lines.append(f"| {name} | {' | '.join([*cells, *([''] if whole else [])])} |")
         return "\n".join(lines)
 
 
@@ -73,39 +100,108 @@ def peak_mb() -> float:
     return float(line.split()[1]) / 1024.0
 
 
-def calibrated(drive: Path, frames: int, cameras: int) -> dict[str, Any]:
-    """In the process that is measured: seconds of both parts, memory, labelled points of a scan."""
+@dataclass(frozen=True)
+class ForthAndBack:
+    """So many frames of a drive, played forth and back under rising stamps (a ``Source``)."""
+
+    source: Any
+    count: int
+
+    @property
+    def name(self) -> str:
+        return str(self.source.name)
+
+    @property
+    def camera(self) -> PinholeCamera:
+        camera: PinholeCamera = self.source.camera
+        return camera
+
+    @property
+    def nominal(self) -> gtsam.Pose3 | None:
+        return self.source.nominal
+
+    @property
+    def truth(self) -> GroundTruth | None:
+        truth: GroundTruth | None = self.source.truth
+        return truth
+
+    @property
+    def sweep(self) -> str:
+        return str(self.source.sweep)
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, position: int) -> Frame:
+        if not 0 <= position < self.count:
+            raise IndexError(position)
+        return Frame(position, self.read_scan(position), self.read_image(position))
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (self[position] for position in range(self.count))
+
+    def frame_number(self, position: int) -> int:
+        return position
+
+    def read_scan(self, position: int) -> Scan:
+        return replace(self.source.read_scan(self._played(position)), stamp_ns=position * PERIOD_NS)
+
+    def read_image(self, position: int) -> CameraImage:
+        return replace(self.source.read_image(self._played(position)), stamp_ns=position * PERIOD_NS)
+
+    def _played(self, position: int) -> int:
+        last = len(self.source) - 1
+        phase = position % (2 * last)
+        return phase if phase <= last else 2 * last - phase
+
+
+def calibrated(drive: Path, frames: int, cameras: int, whole: bool) -> dict[str, Any]:
+    """In the process that is measured: seconds of all parts, memory, labelled points of a scan."""
     cv2.setNumThreads(1)
-    source, config = open_source(drive)[:frames], CalibrationConfig()
-    assert source.nominal is not None
+    source = ForthAndBack(open_source(drive), frames)
+    config = CalibrationConfig(method="joint", find_causes=False, decide_sweep=False)
+    assert source.nominal is not None and source.truth is not None
     began = time.process_time()
-    if cameras == 1:
-        drives = prepare_drives([source], config)
-        prepared = time.process_time()
-        status = calibrate_prepared(drives, source.nominal, config).status
-    else:
-        names = [f"cam{k}" for k in range(cameras)]
-        of_rig = prepare_rig({name: [source] for name in names}, config)
-        prepared = time.process_time()
-        guesses = {name: Guess(source.nominal, 0.0) for name in names}
-        status = calibrate_rig_prepared(of_rig, guesses, config, KnownRig()).status
-    ended = time.process_time()
-    peak, scan = peak_mb(), source[0].scan
+    names = [f"cam{k}" for k in range(cameras)]
+    drives = (
+        {"cam0": prepare_drives([source], config)}
+        if cameras == 1
+        else prepare_rig({name: [source] for name in names}, config)
+    )
+    prepared = time.process_time()
+    for own in drives.values():
+        solve_twelve(own, source.truth, config)
+    solved, status = time.process_time(), ""
+    if whole and cameras == 1:
+        status = calibrate_prepared(drives["cam0"], source.nominal, config).status
+    elif whole:
+        guesses = dict.fromkeys(names, Guess(source.nominal, 0.0))
+        status = calibrate_rig_prepared(drives, guesses, config, KnownRig()).status
+    ended, peak, scan = time.process_time(), peak_mb(), source[0].scan
     assert scan is not None
     labelled = int((scan.classes == SemanticClass.VEHICLE).sum())
-    seconds = {"prepare": prepared - began, "solve": ended - prepared}
+    seconds = {"prepare": prepared - began, "solve": solved - prepared, "estimate": ended - solved}
     return {**seconds, "peak_mb": peak, "labelled": labelled, "status": status}
 
 
-def measured(drive: Path, frames: int, cameras: int = 1) -> tuple[list[float], float]:
-    """The costs of a process of its own, and labelled points of a scan."""
+def solve_twelve(drives: Sequence[Drive], truth: GroundTruth, config: CalibrationConfig) -> None:
+    """Outer iterations from the truth, the same number whatever they find."""
+    problem = CalibrationProblem.of(drives, Guess(truth.cTl, truth.time_offset_s), config)
+    joint = replace(problem.joint(), config=replace(problem.config.joint, max_outer=ITERATIONS))
+    found = solve_joint(joint, State(truth.cTl, (truth.time_offset_s,)), step_sigmas=0.0)
+    assert found.outer_iterations == ITERATIONS
+
+
+def measured(drive: Path, frames: int, whole: bool, cameras: int = 1) -> dict[str, Any]:
+    """What a process of its own took."""
     command = [sys.executable, "-m", "benchmarks.scaling", "--one", str(drive), str(frames), str(cameras)]
+    command += ["--whole"] if whole else []
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
     if done.returncode:
         raise SystemExit(f"a calibration ended with {done.returncode}")
-    found = json.loads(done.stdout.splitlines()[-1])
+    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     print(f"{drive.name}, {frames} frames, {cameras} cameras: {found}", file=sys.stderr, flush=True)
-    return [found["prepare"], found["solve"], found["peak_mb"]], found["labelled"]
+    return found
 
 
 def written(folder: Path, name: str, config: SimulationConfig) -> Path:
@@ -113,36 +209,34 @@ def written(folder: Path, name: str, config: SimulationConfig) -> Path:
     return folder / name
 
 
-def by_frames(folder: Path, sizes: Sequence[float]) -> Series:
-    drive = written(folder, "frames", replace(STREET, frames=int(max(sizes))))
-    costs = [measured(drive, int(size))[0] for size in sizes]
-    return Series("frames", np.array(sizes), np.array(costs))
+def by_frames(folder: Path, sizes: Sequence[float], whole: bool) -> Series:
+    drive = written(folder, "frames", replace(STREET, frames=STREET_FRAMES))
+    return Series.of("frames", sizes, [measured(drive, int(size), whole) for size in sizes])
 
 
-def by_points(folder: Path, steps_deg: Sequence[float]) -> Series:
-    costs, labelled = [], []
+def by_points(folder: Path, steps_deg: Sequence[float], whole: bool) -> Series:
+    found = []
     for step in sorted(steps_deg, reverse=True):
-        dense = replace(STREET, azimuth_step_deg=step, vehicle_density=0.3)
-        cost, points = measured(written(folder, f"step{step:g}", dense), STREET.frames)
-        costs.append(cost)
-        labelled.append(points)
-    return Series("labelled points a scan, 20 frames", np.array(labelled), np.array(costs))
+        dense = replace(STREET, azimuth_step_deg=step, vehicle_density=0.4, truck_fraction=0.6)
+        found.append(measured(written(folder, f"step{step:g}", dense), FRAMES, whole))
+    labelled = [one["labelled"] for one in found]
+    return Series.of(f"labelled points a scan, {FRAMES} frames", labelled, found)
 
 
-def by_image(folder: Path, scales: Sequence[float]) -> Series:
-    costs, pixels = [], []
+def by_image(folder: Path, scales: Sequence[float], whole: bool) -> Series:
+    found, pixels = [], []
     for scale in scales:
         width, height = round(1242 * scale), round(375 * scale)
         config = replace(STREET, width=width, height=height)
-        costs.append(measured(written(folder, f"{width}x{height}", config), STREET.frames)[0])
+        found.append(measured(written(folder, f"{width}x{height}", config), FRAMES, whole))
         pixels.append(width * height)
-    return Series("pixels of an image, 20 frames", np.array(pixels), np.array(costs))
+    return Series.of(f"pixels of an image, {FRAMES} frames", pixels, found)
 
 
-def by_cameras(folder: Path, sizes: Sequence[float]) -> Series:
+def by_cameras(folder: Path, sizes: Sequence[float], whole: bool) -> Series:
     drive = written(folder, "cameras", STREET)
-    costs = [measured(drive, STREET.frames, int(size))[0] for size in sizes]
-    return Series("cameras, 20 frames", np.array(sizes), np.array(costs))
+    found = [measured(drive, FRAMES, whole, int(size)) for size in sizes]
+    return Series.of(f"cameras, {FRAMES} frames", sizes, found)
 
 
 SERIES = {"frames": by_frames, "points": by_points, "image": by_image, "cameras": by_cameras}
@@ -168,14 +262,17 @@ def main() -> None:
     )
     parser.add_argument("--out", type=Path, default=Path("out/scaling"))
     parser.add_argument("--only", nargs="+", choices=tuple(SERIES), default=list(SERIES))
-    parser.add_argument("--frames", nargs="+", type=int, default=[15, 30, 60, 120, 240])
-    parser.add_argument("--points", nargs="+", type=float, default=[3.0, 0.8, 0.2, 0.05], metavar="STEP_DEG")
+    parser.add_argument("--frames", nargs="+", type=int, default=[1, 10, 40, 160, 400])
+    parser.add_argument(
+        "--points", nargs="+", type=float, default=[4.0, 1.0, 0.25, 0.06, 0.02], metavar="STEP_DEG"
+    )
     parser.add_argument("--image", nargs="+", type=float, default=[0.25, 0.5, 1.0, 2.0], metavar="SCALE")
     parser.add_argument("--cameras", nargs="+", type=int, default=[1, 2, 4, 6])
+    parser.add_argument("--whole", action="store_true", help="the whole estimate, too")
     parser.add_argument("--one", nargs=3, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.one:
-        print(json.dumps(calibrated(Path(args.one[0]), int(args.one[1]), int(args.one[2]))))
+        print(json.dumps(calibrated(Path(args.one[0]), int(args.one[1]), int(args.one[2]), args.whole)))
         return
     sizes = {name: sorted(getattr(args, name), reverse=name == "points") for name in args.only}
     for name, each in sizes.items():
@@ -185,7 +282,7 @@ def main() -> None:
     series: list[Series] = []
     for name in args.only:
         with tempfile.TemporaryDirectory() as folder:
-            series.append(SERIES[name](Path(folder), sizes[name]))
+            series.append(SERIES[name](Path(folder), sizes[name], args.whole))
         print(series[-1].table() + "\n", flush=True)
         (args.out / "scaling.md").write_text("\n\n".join(each.table() for each in series) + "\n")
     draw(series, args.out / "scaling.svg")

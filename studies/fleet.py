@@ -2,10 +2,15 @@
 
     python studies/fleet.py --vehicles 10 --drives 20 --out out/fleet
 
-makes the drives (kept in OUT/drives, so a second run starts at once), calibrates them one after the other by
-``sst-graph calibrate``, then by ``sst-graph batch`` while processes of drives are killed at random and the
-batch itself is killed once and resumed, and compares: every result there, each byte-equal to the sequential
-one, the changed vehicles found, no other accused. Prints one Markdown table.
+makes the drives (kept in OUT/drives, so a second run starts at once), calibrates them one after the other as
+``sst-graph calibrate`` does, then by ``sst-graph batch`` on two workers while processes of drives are killed
+at random and the batch itself is killed twice and resumed, and compares: every result there, each byte-equal
+to the sequential one, the changed vehicles found, no other accused. Prints one Markdown table.
+
+    python studies/fleet.py --vehicles 10 --drives 20 --on-dask 2 7 --out out/fleet
+
+then calibrates the drives of two vehicles again on a local Dask cluster of two workers, which are killed at
+random (each with the drive that it runs); the cluster starts another in its place.
 
     python studies/fleet.py --empty 100000 --out out/empty
 
@@ -16,7 +21,7 @@ from __future__ import annotations
 
 import argparse
 import csv
-import json
+import io
 import os
 import resource
 import shutil
@@ -26,13 +31,15 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass, replace
 from datetime import date, timedelta
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 
+from sst_graph.cli import main as main_of_program
 from sst_graph.files import MANIFEST
 from sst_graph.fleet import BatchConfig, Drive, Place, Record, write_summary
 from sst_graph.fleet import batch as fleet_batch
@@ -43,10 +50,10 @@ from sst_graph.simulator.drive import NOMINAL_CTL, mounting_error
 from sst_graph.types import GroundTruth
 
 SMALL = SimulationConfig(
-    frames=8,
+    frames=6,
     width=400,
     height=120,
-    frame_rate_hz=4.0,
+    frame_rate_hz=3.0,
     motion="mixed",
     speed_mps=6.0,
     azimuth_limit_deg=45.0,
@@ -57,7 +64,7 @@ SMALL = SimulationConfig(
     rotation_error_deg=0.7,
     translation_error_m=0.03,
 )
-"""Eight small pictures at 4 Hz: stands, accelerates, turns and brakes."""
+"""Six small pictures at 3 Hz: stands, accelerates, turns and brakes."""
 PROGRAM = [sys.executable, "-m", "sst_graph.cli"]
 SETTINGS = ["--no-report"]
 for _setting in (
@@ -73,6 +80,8 @@ for _setting in (
     SETTINGS += ["--set", _setting]
 """Of both runs, to save time: the street's own tests of its assumptions are of no concern here."""
 FIRST_DAY = date(2026, 3, 2)
+DRIVE, DASK_WORKER = "sst_graph.cli calibrate", "spawn_main"
+"""In the command lines of a drive's process, and of a Dask worker's."""
 
 
 @dataclass(frozen=True)
@@ -98,17 +107,21 @@ CHANGES = {
 """Two mounts that are knocked and a clock that is set."""
 
 
-def drive_of(
-    vehicle: int, number: int, change: Change | None, config: SimulationConfig = SMALL
-) -> SimulatedDrive:
-    """A drive of a vehicle through a street of its own, seen by the vehicle's own mount and clock."""
+def drive_of(vehicle: int, number: int, change: Change | None) -> SimulatedDrive:
+    """A drive of a vehicle through the street of that number, with the vehicle's mount, clock and noise."""
     own = np.random.default_rng([77, vehicle])
-    cTl = NOMINAL_CTL * mounting_error(config, own)
+    cTl = NOMINAL_CTL * mounting_error(SMALL, own)
     offset_s = float(np.round(own.uniform(-0.03, 0.03), 4))
     if change is not None and number >= change.before:
         cTl, offset_s = cTl.retract(np.array(change.step)), offset_s + change.offset_s
-    config = replace(config, seed=1000 * vehicle + number, time_offset_s=offset_s)
-    return replace(simulate(config), truth=GroundTruth(cTl, offset_s))
+    config = replace(SMALL, seed=1000 * vehicle + number, time_offset_s=offset_s)
+    return replace(_through_street(number), config=config, truth=GroundTruth(cTl, offset_s))
+
+
+@lru_cache(maxsize=1)
+def _through_street(number: int) -> SimulatedDrive:
+    """A drive through a street; building one takes as long as the drive's pictures, so vehicles share it."""
+    return simulate(replace(SMALL, seed=number))
 
 
 def make_fleet(folder: Path, vehicles: Sequence[int], drives: int) -> list[Path]:
@@ -139,24 +152,36 @@ def add_bad_drives(folder: Path) -> list[Path]:
     return [cut, spoilt, empty]
 
 
-def calibrate_one_by_one(drives: Sequence[Path], out: Path) -> dict[str, tuple[float, float]]:
-    """Wall and processor seconds of ``sst-graph calibrate`` for each drive that has no result yet."""
-    took = {}
+def calibrate_one_by_one(drives: Sequence[Path], out: Path) -> list[tuple[float, float]]:
+    """Wall and processor seconds of ``sst-graph calibrate`` for each drive."""
+    took = []
     for drive in drives:
-        if (out / drive.name).exists():
-            continue
         before, started = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
         command = [*PROGRAM, "calibrate", str(drive), "--out", str(out / drive.name), *SETTINGS]
         subprocess.run(command, env=environment(), capture_output=True, check=False)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-        took[drive.name] = (time.monotonic() - started, cpu)
+        took.append((time.monotonic() - started, cpu))
     return took
 
 
-def batch_command(drives: Path, out: Path, workers: int = 2) -> list[str]:
+def calibrate_in_this_process(drives: Sequence[Path], out: Path) -> None:
+    """The results of ``sst-graph calibrate`` for drives that have none yet, one after the other.
+
+    One process for all of them: the imports, a third of a small drive's time, are paid once.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    for drive in drives:
+        if (out / drive.name).exists():
+            continue
+        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+            main_of_program(["calibrate", str(drive), "--out", str(out / drive.name), *SETTINGS])
+
+
+def batch_command(drives: Path, out: Path, workers: int = 2, dask: str = "") -> list[str]:
     """The command line of the batch."""
     named = ["--vehicle-from", r"(?P<vehicle>v\d+)_(?P<date>[\d-]+)$"]
+    named += ["--dask", dask] if dask else []
     return [*PROGRAM, "batch", str(drives), "--out", str(out), "--workers", str(workers), *named, *SETTINGS]
 
 
@@ -174,17 +199,22 @@ class Killed:
     """How many processes were killed.
 
     Attributes:
-        drives: processes of drives; batches: the batch itself.
+        drives: processes of drives, or workers of Dask; batches: the batch itself.
     """
 
     drives: int = 0
     batches: int = 0
 
 
-def run_with_kills(command: Sequence[str], rng: np.random.Generator, every_s: float, batches: int) -> Killed:
-    """Run a batch to its end while processes of drives are killed at random (SIGKILL).
+def run_with_kills(
+    command: Sequence[str], rng: np.random.Generator, every_s: float, batches: int, mark: str = DRIVE
+) -> Killed:
+    """Run a batch to its end while processes that it started are killed at random (SIGKILL).
 
     For some times the batch itself is killed, too, and started again.
+
+    Args:
+        mark: stands in the command line of those that are killed.
     """
     killed = Killed()
     while True:
@@ -201,7 +231,7 @@ def run_with_kills(command: Sequence[str], rng: np.random.Generator, every_s: fl
                 break
             if now > next_at:
                 next_at = now + rng.exponential(every_s)
-                running = children(process.pid)
+                running = children(process.pid, mark)
                 if running:
                     os.kill(int(rng.choice(running)), signal.SIGKILL)
                     killed.drives += 1
@@ -209,13 +239,19 @@ def run_with_kills(command: Sequence[str], rng: np.random.Generator, every_s: fl
             return killed
 
 
-def children(pid: int) -> list[int]:
-    """Processes that another one started (Linux)."""
+def children(pid: int, mark: str) -> list[int]:
+    """Processes that another one started and whose command line has a mark (Linux)."""
     found = []
     for task in Path(f"/proc/{pid}/task").glob("*/children"):
         with suppress(OSError):
             found += [int(one) for one in task.read_text().split()]
-    return found
+    return [one for one in found if mark in _command_line(one)]
+
+
+def _command_line(pid: int) -> str:
+    with suppress(OSError):
+        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+    return ""
 
 
 def unlike(expected: Path, found: Path) -> list[str]:
@@ -294,6 +330,7 @@ def main() -> None:
     parser.add_argument("--kill-every", type=float, default=15.0, help="mean seconds between kills")
     parser.add_argument("--kill-batch", type=int, default=2, help="how often the batch itself is killed")
     parser.add_argument("--timed", type=int, default=20, help="drives whose batch is timed without kills")
+    parser.add_argument("--on-dask", type=int, nargs="+", default=[], metavar="VEHICLE")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("out/fleet"))
     parser.add_argument("--empty", type=int, metavar="N", help="only the scheduler, with N drives of no work")
@@ -302,52 +339,67 @@ def main() -> None:
     if given.empty:
         measure_scheduler(given.empty, given.out, 2, given.dask)
         return
-    folder, alone, batch = given.out / "drives", given.out / "one_by_one", given.out / "batch"
-    drives = make_fleet(folder, range(given.vehicles), given.drives)
-    bad = add_bad_drives(folder)
-    times_file = given.out / "one_by_one.json"
-    took = json.loads(times_file.read_text()) if times_file.exists() else {}
-    took |= calibrate_one_by_one(drives, alone)
-    times_file.write_text(json.dumps(took))
+    drives = make_fleet(given.out / "drives", range(given.vehicles), given.drives)
+    bad = add_bad_drives(given.out / "drives")
+    alone = given.out / "one_by_one"
+    calibrate_in_this_process(drives, alone)
+    kill_at_random = partial(run_with_kills, rng=np.random.default_rng(given.seed), every_s=given.kill_every)
 
-    killed = run_with_kills(
-        batch_command(folder, batch), np.random.default_rng(given.seed), given.kill_every, given.kill_batch
-    )
-    code, _, _ = run_batch(batch_command(folder, batch))  # nothing left to do but what was killed too often
-    differ = unlike(alone, batch / "drives")
+    print("| what | found |\n|---|---|")
+    print(f"| drives, vehicles, drives that cannot be read | {len(drives)}, {given.vehicles}, {len(bad)} |")
+    batch = given.out / "batch"
+    killed = kill_at_random(batch_command(given.out / "drives", batch), batches=given.kill_batch)
+    print(f"| processes of drives killed, batches killed | {killed.drives}, {killed.batches} |", flush=True)
+    print_outcome(batch, drives, alone)
+    if given.timed:
+        print_efficiency(drives[:: max(1, len(drives) // given.timed)][: given.timed], given.out)
+    if given.on_dask:
+        some = [drive for drive in drives if int(drive.name[1:3]) in given.on_dask]
+        command = batch_command(linked(some, given.out / "some"), given.out / "dask", dask="local")
+        killed = kill_at_random(command, batches=0, mark=DASK_WORKER)
+        print(f"| on Dask: drives, workers killed | {len(some)}, {killed.drives} |")
+        print_outcome(given.out / "dask", some, alone)
+
+
+def print_outcome(batch: Path, drives: Sequence[Path], alone: Path) -> None:
+    """Rows of a table: what a batch left, beside what ``calibrate`` made of each drive."""
     with open(batch / "vehicles.csv", newline="") as stream:
         vehicles = list(csv.DictReader(stream))
     with open(batch / "summary.csv", newline="") as stream:
         rows = list(csv.DictReader(stream))
-
-    some = given.out / "some"
-    shutil.rmtree(some, ignore_errors=True)
-    some.mkdir()
-    timed = [drive for drive in drives if drive.name in took][: given.timed]
-    for drive in timed:
-        (some / drive.name).symlink_to(drive.resolve())
-    shutil.rmtree(given.out / "timed", ignore_errors=True)
-    shutil.rmtree(given.out / "timed_one", ignore_errors=True)
-    alone_again = calibrate_one_by_one(timed, given.out / "timed_one")
-    _, wall_s, cpu_s = run_batch(batch_command(some, given.out / "timed"))
-    alone_s, alone_cpu_s = np.sum(list(alone_again.values()), axis=0)
-
-    print("| what | found |\n|---|---|")
-    print(f"| drives, vehicles, drives that cannot be read | {len(drives)}, {given.vehicles}, {len(bad)} |")
-    print(f"| processes of drives killed, batches killed | {killed.drives}, {killed.batches} |")
-    print(f"| exit code | {code} |")
     counts = Counter(row["status"] for row in rows).most_common()
     print(f"| status | {', '.join(f'{count} {status}' for status, count in counts)} |")
     there = sum((batch / "drives" / drive.name).is_dir() for drive in drives)
     print(f"| results there | {there} of {len(drives)} |")
-    print(f"| files unlike those of the sequential run | {len(differ)} |")
+    print(f"| most attempts at a drive | {max(int(row['attempts']) for row in rows)} |")
+    differ = sum(len(unlike(alone / drive.name, batch / "drives" / drive.name)) for drive in drives)
+    print(f"| files unlike those of the sequential run | {differ} |")
     for row in vehicles:
         if row["status"] != "ok":
             print(f"| {row['vehicle']} | {row['reason']} |")
-    print(f"| vehicles not accused | {sum(row['status'] == 'ok' for row in vehicles)} |")
-    print(f"| {len(timed)} drives one by one: wall, processor | {alone_s:.0f} s, {alone_cpu_s:.0f} s |")
+    print(f"| vehicles not accused | {sum(row['status'] == 'ok' for row in vehicles)} |", flush=True)
+
+
+def print_efficiency(drives: Sequence[Path], out: Path) -> None:
+    """Rows of a table: what drives take one by one, and by a batch without kills."""
+    for name in ("timed", "timed_one"):
+        shutil.rmtree(out / name, ignore_errors=True)
+    one_by_one = calibrate_one_by_one(drives, out / "timed_one")
+    _, wall_s, cpu_s = run_batch(batch_command(linked(drives, out / "some"), out / "timed"))
+    alone_s, alone_cpu_s = np.sum(one_by_one, axis=0)
+    print(f"| {len(drives)} drives one by one: wall, processor | {alone_s:.0f} s, {alone_cpu_s:.0f} s |")
     print(f"| the same by batch on 2 workers: wall, processor | {wall_s:.0f} s, {cpu_s:.0f} s |")
-    print(f"| efficiency: wall, processor | {alone_s / (2.0 * wall_s):.2f}, {alone_cpu_s / cpu_s:.2f} |")
+    efficiency = f"{alone_s / (2.0 * wall_s):.2f}, {alone_cpu_s / cpu_s:.2f}"
+    print(f"| efficiency: wall, processor | {efficiency} |", flush=True)
+
+
+def linked(drives: Sequence[Path], folder: Path) -> Path:
+    """A folder of links to drives."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    for drive in drives:
+        (folder / drive.name).symlink_to(drive.resolve())
+    return folder
 
 
 if __name__ == "__main__":

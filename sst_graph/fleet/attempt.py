@@ -24,6 +24,12 @@ DRIVES, RECORDS = "drives", "records"
 RESULT = "calibration.json"
 
 _EXIT_DONE, _EXIT_BAD_INPUT, _EXIT_NOT_TRUSTED = 0, 2, 3
+MOST_KILLS = 10
+"""Attempts that others may end (the machine is taken away, an operator, ...) before a drive is given up.
+
+They say nothing of the drive, so they are no part of its retries; without an end, a machine that kills all it
+runs would keep a batch for ever.
+"""
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _PROGRAM_MODULE, _SAID_BY_IT = "sst_graph.cli", "sst-graph: "
 
@@ -38,7 +44,7 @@ class Job:
         out: the batch's folder.
         folder: where the program was started: relative paths begin there.
         limits: of one attempt.
-        retries: further attempts after a crash.
+        retries: further attempts after a crash, or where something could not be copied.
     """
 
     drive: Drive
@@ -60,22 +66,30 @@ class Job:
 
 
 def run_drive(job: Job) -> Record:
-    """Calibrate one drive, again after a crash, and write its record. Never raises for what the drive does.
+    """Calibrate one drive, again after a crash or a kill, and write its record. Never raises for the drive.
 
     A result that stands there whole, as of a task that a scheduler repeats, is taken as it is.
     """
     record = finished_record(job)
-    attempts = 0
-    while record is None or (record.status in ("crash", "storage") and attempts <= job.retries):
+    attempts = kills = 0
+    while record is None or _is_to_be_repeated(record.status, attempts - kills - 1 < job.retries, kills):
         if has_ended():
             return Record(job.drive.name, job.drive.place.url, "not_run", "the batch was ended before")
         attempts += 1
         record = _attempt(job)
+        kills += record.status == "killed"
         record = replace(record, cost=replace(record.cost, attempts=attempts))
     if attempts and not has_ended():
         with contextlib.suppress(SstGraphError, OSError):
             job.record.write(record.to_json().encode("utf-8"))
     return record
+
+
+def _is_to_be_repeated(status: Status, has_retries: bool, kills: int) -> bool:
+    """Whether a further attempt is made after one that ended so."""
+    if status == "killed":
+        return kills < MOST_KILLS
+    return status in ("crash", "storage") and has_retries
 
 
 def finished_record(job: Job, stored: bytes | None = None) -> Record | None:
@@ -178,6 +192,13 @@ def _of_ending(job: Job, ending: Ending) -> Record:
         status, reason = "time_limit", f"took more than {job.limits.wall_s:g} s"
     elif ending.code == _EXIT_BAD_INPUT and said:
         status, reason = "bad_input", said
+    elif ending.from_outside and not ending.short_of_memory:
+        status, reason = "killed", f"ended from outside by {ending.words} after {ending.wall_s:.1f} s"
+    elif ending.from_outside:
+        reason = (
+            f"ended by {ending.words} at {gigabytes:.2f} GB of memory, while the kernel ended processes for "
+            "want of it: fewer --workers, or a --memory-limit"
+        )
     else:
         last = said or next((line.strip() for line in reversed(ending.log) if line.strip()), "")
         reason = f"ended by {ending.words} after {ending.wall_s:.1f} s" + (f": {last}" if last else "")

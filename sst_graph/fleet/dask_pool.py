@@ -1,12 +1,16 @@
 """Drives on a cluster of dask.distributed (extra ``dask``): the same work on other machines.
 
 A task runs one drive as the local pool does, in a process of its own below the Dask worker. Where a worker is
-lost, the scheduler repeats its task elsewhere; a result that is whole by then is taken as it is.
+lost, the scheduler repeats its task elsewhere; a result that is whole by then is taken as it is. What the
+scheduler gives up (by default after four lost workers) is given to it again: a drive cannot end its worker,
+so that lost workers say nothing of it.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any
@@ -18,6 +22,8 @@ from sst_graph.fleet.record import Record
 LOCAL = "local"
 """In the place of an address: a cluster on this machine, started for the batch."""
 _PATIENCE_S, _CONNECT_S = 0.5, 20.0
+_MOST_ROUNDS = 3
+"""How often a drive is given to the scheduler; an end is needed where all workers are killed for ever."""
 _AHEAD = 4
 """Tasks at the scheduler for each that can run: enough that none waits, few enough for its memory."""
 
@@ -41,17 +47,24 @@ def run_on_dask(
     """The records of all jobs, as they are done; None now and then while there is none.
 
     Raises:
-        ConfigError: no scheduler answers.
+        ConfigError: no scheduler answers, or it is lost.
         MissingDependencyError: dask.distributed is not installed.
     """
     distributed = _distributed()
     with _client(distributed, cluster) as client:
         waiting = iter(jobs)
         running: dict[Any, Job] = {}
+        rounds: Counter[str] = Counter()
+
+        def submit(job: Job) -> None:
+            name = job.drive.name
+            rounds[name] += 1
+            running[client.submit(run, job, pure=False, key=f"sst-graph-{name}-{rounds[name]}")] = job
+
         while True:
             threads = sum(one["nthreads"] for one in client.scheduler_info(n_workers=-1)["workers"].values())
             for job in islice(waiting, max(_AHEAD * max(threads, 1) - len(running), 0)):
-                running[client.submit(run, job, pure=False, key=f"sst-graph-{job.drive.name}")] = job
+                submit(job)
             if not running:
                 return
             try:
@@ -61,20 +74,33 @@ def run_on_dask(
             except (TimeoutError, distributed.TimeoutError):
                 yield None
                 continue
+            except CancelledError:
+                raise ConfigError(
+                    f"--dask {cluster.address}: lost the scheduler with {len(running)} drives at it; "
+                    "the same command goes on from here, on this one or another"
+                ) from None
             for future in done:
-                yield _record(future, running.pop(future))
+                job, error = running.pop(future), future.exception()
+                is_lost = isinstance(error, distributed.KilledWorker)
+                if is_lost and rounds[job.drive.name] < _MOST_ROUNDS:
+                    submit(job)
+                else:
+                    del rounds[job.drive.name]
+                    yield _record(future, job, error, is_lost)
                 future.release()
 
 
-def _record(future: Any, job: Job) -> Record:
-    """What a task gave; a task that killed every worker it was given to has crashed."""
-    error = future.exception()
+def _record(future: Any, job: Job, error: BaseException | None, is_lost: bool) -> Record:
+    """What a task gave, or why it gave nothing: its workers were lost, or one could not run it."""
     if error is None:
         record = future.result()
         assert isinstance(record, Record)
         return record
     words = " ".join(str(error).split()) or type(error).__name__
-    return Record(job.drive.name, job.drive.place.url, "crash", f"its Dask worker was lost: {words:.500}")
+    name, place = job.drive.name, job.drive.place.url
+    if is_lost:
+        return Record(name, place, "killed", f"its Dask workers were lost, all that it had: {words:.500}")
+    return Record(name, place, "crash", f"could not be run on its Dask worker: {words:.500}")
 
 
 def _client(distributed: Any, cluster: Cluster) -> Any:

@@ -17,6 +17,7 @@ from pathlib import Path
 from sst_graph.config import Settings, setting
 
 GUARD = Path(__file__).with_name("guard.py")
+_KERNEL_COUNTS = "/proc/vmstat"
 _LOG_BYTES, _LOG_LINES = 64 * 1024, 30
 _FIRST_LOOK_S, _LONGEST_PAUSE_S = 0.01, 0.1
 _GRACE_S = 5.0
@@ -49,6 +50,7 @@ class Ending:
         wall_s, cpu_s: what it took [s].
         peak_bytes: its largest resident memory.
         log: last lines of its stderr.
+        short_of_memory: whether the kernel ended processes for want of memory meanwhile (Linux).
     """
 
     code: int
@@ -57,16 +59,30 @@ class Ending:
     cpu_s: float
     peak_bytes: int
     log: tuple[str, ...]
+    short_of_memory: bool = False
+
+    @property
+    def from_outside(self) -> bool:
+        """Whether something else ended it: an operator, a machine that is taken away, the kernel.
+
+        A process that heeds a signal ends with 128 and its number.
+        """
+        return not self.limit and (-self.code in _OF_OTHERS or self.code - 128 in _HEEDED)
 
     @property
     def words(self) -> str:
         """The code for people."""
-        if self.code >= 0:
+        if self.code >= 0 and not self.from_outside:
             return f"exit code {self.code}"
         try:
-            return signal.Signals(-self.code).name
+            return signal.Signals(self.code - 128 if self.code > 0 else -self.code).name
         except ValueError:
             return f"signal {-self.code}"
+
+
+_HEEDED = (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
+_OF_OTHERS = (signal.SIGKILL, *_HEEDED)
+"""Signals that a process gets from others; what goes wrong in it ends it by SIGSEGV, SIGABRT and the like."""
 
 
 def run_isolated(
@@ -84,7 +100,7 @@ def run_isolated(
     """
     guarded = [sys.executable, "-I", "-S", str(GUARD), str(os.getpid()), *command]
     with tempfile.TemporaryFile() as log:
-        started = time.monotonic()
+        started, killed_before = time.monotonic(), _killed_for_memory()
         process = subprocess.Popen(
             guarded,
             stdin=subprocess.DEVNULL,
@@ -100,7 +116,8 @@ def run_isolated(
         finally:
             _running.discard(process.pid)
         process.returncode = code
-        return Ending(code, limit, time.monotonic() - started, cpu_s, peak, _tail(log.fileno()))
+        wall_s, said = time.monotonic() - started, _tail(log.fileno())
+        return Ending(code, limit, wall_s, cpu_s, peak, said, _killed_for_memory() > killed_before)
 
 
 def end_all() -> None:
@@ -166,6 +183,15 @@ def resident_bytes(pid: int) -> int:
         return 0
     done = subprocess.run(["ps", "-o", "rss=", "-p", str(pid)], capture_output=True, text=True, check=False)
     return 1024 * int(done.stdout) if done.stdout.strip().isdigit() else 0
+
+
+def _killed_for_memory() -> int:
+    """How many processes the kernel has ended for want of memory, on the whole machine; 0 if not known."""
+    try:
+        with open(_KERNEL_COUNTS, "rb") as stream:
+            return next((int(line.split()[1]) for line in stream if line.startswith(b"oom_kill ")), 0)
+    except (OSError, ValueError):
+        return 0
 
 
 def _tail(descriptor: int) -> tuple[str, ...]:

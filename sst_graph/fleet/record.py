@@ -30,17 +30,27 @@ Status = Literal[
     "not_converged",
     "bad_input",
     "crash",
+    "killed",
     "memory_limit",
     "time_limit",
     "storage",
     "not_run",
 ]
 """The result's own status, or why there is none: the command refused the data (``bad_input``), its process
-ended by itself (``crash``) or at a limit, the data or the result could not be copied (``storage``), the batch
-ended before (``not_run``)."""
+ended by itself (``crash``), by others (``killed``) or at a limit, the data or the result could not be copied
+(``storage``), the batch ended before (``not_run``)."""
 WITH_RESULT = ("ok", "unobservable", "not_converged")
 
-ATTENTION = ("crash", "memory_limit", "time_limit", "storage", "bad_input", "not_run", "not_converged")
+ATTENTION = (
+    "crash",
+    "memory_limit",
+    "time_limit",
+    "storage",
+    "bad_input",
+    "killed",
+    "not_run",
+    "not_converged",
+)
 """Status by how much it needs to be looked at, most first; then come unobservable and ok."""
 
 

@@ -23,18 +23,21 @@ def run(code: str, limits: Limits | None = None) -> Ending:
 
 
 @pytest.mark.parametrize(
-    ("code", "expected", "words"),
+    ("code", "expected", "words", "from_outside"),
     [
-        ("raise SystemExit(3)", 3, "exit code 3"),
-        ("import ctypes; ctypes.string_at(0)", -signal.SIGSEGV, "SIGSEGV"),
-        ("import os; os.abort()", -signal.SIGABRT, "SIGABRT"),
-        ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", -signal.SIGKILL, "SIGKILL"),
-        ("1 / 0", 1, "exit code 1"),
+        ("raise SystemExit(3)", 3, "exit code 3", False),
+        ("import ctypes; ctypes.string_at(0)", -signal.SIGSEGV, "SIGSEGV", False),
+        ("import os; os.abort()", -signal.SIGABRT, "SIGABRT", False),
+        ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", -signal.SIGKILL, "SIGKILL", True),
+        ("import os, signal; os.kill(os.getpid(), signal.SIGTERM)", -signal.SIGTERM, "SIGTERM", True),
+        ("raise SystemExit(128 + 15)", 143, "SIGTERM", True),
+        ("1 / 0", 1, "exit code 1", False),
     ],
 )
-def test_how_a_process_ended(code: str, expected: int, words: str) -> None:
+def test_how_a_process_ended(code: str, expected: int, words: str, from_outside: bool) -> None:
     ending = run(code)
     assert (ending.code, ending.limit, ending.words) == (expected, "", words)
+    assert ending.from_outside == from_outside and not ending.short_of_memory
 
 
 def test_what_it_took_and_what_it_said() -> None:
@@ -49,7 +52,7 @@ def test_what_it_took_and_what_it_said() -> None:
 def test_the_memory_limit_ends_it() -> None:
     code = "import time\nx = []\nwhile True: x.append(bytearray(1 << 20)); time.sleep(0.002)"
     ending = run(code, Limits(memory_bytes=100 * MB))
-    assert (ending.limit, ending.code) == ("memory", -signal.SIGKILL)
+    assert (ending.limit, ending.code, ending.from_outside) == ("memory", -signal.SIGKILL, False)
     assert 100 * MB < ending.peak_bytes < 400 * MB
 
 

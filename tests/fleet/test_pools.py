@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -27,12 +30,15 @@ def instant(job: Job) -> Record:
     return Record(job.drive.name, job.drive.place.url, "ok")
 
 
+LOSSES = {"drive_0003": 1, "drive_0004": 3, "drive_0005": 1000}
+
+
 def deadly(job: Job) -> Record:
-    """Kills its worker the first time that the third job is tried, and every time for the fifth."""
+    """Kills its worker as often as a drive's number in LOSSES says."""
     mark = Path(job.folder) / job.drive.name
-    first = not mark.exists()
-    mark.touch()
-    if (job.drive.name == "drive_0003" and first) or job.drive.name == "drive_0005":
+    with mark.open("a") as stream:
+        stream.write("x")
+    if mark.stat().st_size <= LOSSES.get(job.drive.name, 0):
         os.kill(os.getpid(), signal.SIGKILL)
     return instant(job)
 
@@ -53,12 +59,62 @@ def test_a_fault_of_the_program_is_no_silence() -> None:
 
 @pytest.mark.slow
 def test_dask_repeats_what_a_lost_worker_had(tmp_path: Path) -> None:
+    """By the scheduler, and where that gives a task up, after two losses here, by the batch."""
     pytest.importorskip("distributed")
-    found = {one.drive: one for one in run_on_dask(jobs(8, tmp_path), Cluster("local", 2), deadly) if one}
+    import dask
+
+    with dask.config.set({"distributed.scheduler.allowed-failures": 1}):
+        found = {one.drive: one for one in run_on_dask(jobs(8, tmp_path), Cluster("local", 2), deadly) if one}
     assert sorted(found) == [job.drive.name for job in jobs(8)]
-    assert found["drive_0003"].status == "ok"
-    assert found["drive_0005"].status == "crash" and "Dask worker was lost" in found["drive_0005"].reason
     assert [one.status for name, one in found.items() if name != "drive_0005"] == ["ok"] * 7
+    assert found["drive_0005"].status == "killed" and "Dask workers were lost" in found["drive_0005"].reason
+    assert len((tmp_path / "drive_0004").read_text()) >= 4
+    assert len((tmp_path / "drive_0005").read_text()) <= 6
+
+
+def broken(job: Job) -> Record:
+    raise ModuleNotFoundError("No module named 'sst_graph'")
+
+
+@pytest.mark.slow
+def test_a_worker_that_cannot_run_a_drive_is_no_lost_worker() -> None:
+    pytest.importorskip("distributed")
+    found = [one for one in run_on_dask(jobs(2), Cluster("local", 1), broken) if one]
+    assert [one.status for one in found] == ["crash", "crash"]
+    assert "could not be run on its Dask worker: No module named 'sst_graph'" in found[0].reason
+
+
+def fatal(job: Job) -> Record:
+    """Kills the scheduler, whose process id stands in a file."""
+    os.kill(int((Path(job.folder) / "pid").read_text()), signal.SIGKILL)
+    return instant(job)
+
+
+@pytest.mark.slow
+def test_a_lost_scheduler_is_a_sentence(tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    address = f"tcp://127.0.0.1:{free_port()}"
+    scheduler = started("scheduler", "--host", address)
+    worker = started("worker", address, "--no-nanny")
+    (tmp_path / "pid").write_text(str(scheduler.pid))
+    try:
+        with pytest.raises(ConfigError, match="lost the scheduler"):
+            list(run_on_dask(jobs(3, tmp_path), Cluster(address, 1), fatal))
+    finally:
+        for one in (worker, scheduler):
+            one.kill()
+            one.wait()
+
+
+def started(kind: str, *arguments: str) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", f"distributed.cli.dask_{kind}", "--no-dashboard", *arguments]
+    return subprocess.Popen(command, stderr=subprocess.DEVNULL)
+
+
+def free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
 
 
 def test_no_scheduler(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import gtsam
 import numpy as np
@@ -17,10 +19,20 @@ from sst_graph.errors import DataError
 from sst_graph.export import fuse_marginals, marginal_of_result
 from sst_graph.factors import PinholeCamera
 from sst_graph.fleet import BatchConfig, Drive, Place, Record, write_summary
-from sst_graph.fleet.record import Cost, Numbers
+from sst_graph.fleet.record import Cost, Numbers, Status
+from sst_graph.fleet.summary import page as summary_page
 from sst_graph.fleet.vehicles.fused import vehicle_of
 from sst_graph.fleet.vehicles.walk import WalkConfig
 from sst_graph.result import CalibrationResult
+
+
+def test_every_status_has_a_colour_and_a_rank() -> None:
+    style = (Path(summary_page.__file__).parent / "page.css").read_text()
+    ranks = [Record("d", "/d", status).attention for status in get_args(Status)]
+    assert sorted(ranks) == list(range(len(ranks)))
+    for status in get_args(Status):
+        assert re.search(rf"\.s-{status}\b", style), status
+
 
 CAMERA = PinholeCamera(700.0, 700.0, 600.0, 180.0, 1242, 375)
 SHIFT = np.array([0.0, 0.002, 0.0, 0.01, 0.0, 0.0, 0.0])
@@ -63,7 +75,7 @@ def batch() -> tuple[list[Drive], dict[str, Record]]:
     records += [
         done("b0", result(9, "not_converged")),
         Record("c0", "/data/c0", "bad_input", "=cmd|x: <script>alert(1)</script>", log=("a", "b")),
-        Record("d0", "/data/d0", "crash", "ended by SIGSEGV after 1.0 s"),
+        Record("d0", "/data/d0", "crash", "ended by SIGSEGV after 1.0 s", Cost(3, 1.0, 1.0, 10**9, 10**6)),
     ]
     return drives, {one.drive: one for one in records}
 
@@ -112,7 +124,10 @@ def test_the_page_shows_failures_and_runs_nothing_of_the_data(
     assert "6 of 10 drives are ok; 3 have no result; 3 of 3 vehicles need attention" in page
     assert "1 × crash: ended by SIGSEGV after 1.0 s" in page
     assert 'href="drives/a0/report.md"' in page and "http" not in page.replace("http://www.w3.org", "")
-    assert page.index('row">d0<') < page.index('row">c0<') < page.index(">b0</a>") < page.index(">a0</a>")
+    assert 'href="records/d0.json">d0</a>' in page and "records/e0" not in page
+    # seven drives of 8 s and one of 1 s
+    assert "Took 1.0 minutes of processor time" in page and "1.0 GB of memory at most" in page
+    assert page.index(">d0</a>") < page.index('row">c0<') < page.index(">b0</a>") < page.index(">a0</a>")
 
 
 def test_all_fine(tmp_path: Path) -> None:

@@ -78,7 +78,21 @@ def _verdict(rows: Sequence[Row], vehicle_rows: Sequence[Row]) -> str:
         + "</p>",
         f'<div class="bars">{bars}</div>',
         paragraph(counts_line(rows)),
+        paragraph(_cost_line(rows), "note"),
         bullets(f"{count} × {kind}" for kind, count in reasons.most_common(12)),
+    )
+
+
+def _cost_line(rows: Sequence[Row]) -> str:
+    """What the drives took, the last attempt at each."""
+    seconds, peak_mb, input_mb = (
+        [float(row[name] or 0.0) for row in rows] for name in ("cpu_s", "peak_mb", "input_mb")
+    )
+    hours = sum(seconds) / 3600.0
+    took = f"{hours:.1f} hours" if hours >= 1.0 else f"{60.0 * hours:.1f} minutes"
+    return (
+        f"Took {took} of processor time (the last attempt at each drive; median {np.median(seconds):.0f} s), "
+        f"{max(peak_mb) / 1e3:.1f} GB of memory at most, and {sum(input_mb) / 1e3:.1f} GB of data."
     )
 
 
@@ -102,7 +116,7 @@ def _vehicles(rows: Sequence[Row]) -> str:
             f'<td class="why">{text(str(row["reason"]))}</td><td class="num">{row["drives"]}</td>'
             f'<td class="num">{row["without"]}</td>{_sigma_cells(row)}</tr>'
         )
-    heads = ("vehicle", "status", "what happened", "drives", "without", *_SIGMA_HEADS)
+    heads = ("vehicle", "status", "what happened", "drives", "not counted", *_SIGMA_HEADS)
     return section(
         "vehicles",
         "Vehicles",
@@ -118,8 +132,10 @@ def _drives(rows: Sequence[Row]) -> str:
     lines = []
     for row in rows[:MOST_ROWS]:
         name = text(str(row["drive"]))
-        if row["report"]:
-            name = f'<a href="{quote(str(row["report"]))}">{name}</a>'
+        # A drive without result has the last lines of its stderr in its record.
+        link = str(row["report"]) or (f"records/{row['drive']}.json" if row["attempts"] else "")
+        if link:
+            name = f'<a href="{quote(link)}">{name}</a>'
         seconds = float(row["wall_s"] or 0.0)
         lines.append(
             f'<tr data-status="{row["status"]}"><th scope="row">{name}</th>'
@@ -135,7 +151,11 @@ def _drives(rows: Sequence[Row]) -> str:
     return section(
         "drives",
         "Drives",
-        paragraph("What needs attention comes first; a click on a head sorts.", "note"),
+        paragraph(
+            "What needs attention comes first; a click on a head sorts. A name leads to a drive's report, "
+            "or to the record of what went wrong.",
+            "note",
+        ),
         paragraph(note, "note") if note else "",
         '<div class="filters"><label>status <select id="status"><option value="">all</option>'
         f'{choices}</select></label><label>words <input id="words" type="search"></label>'

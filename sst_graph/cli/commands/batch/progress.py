@@ -19,7 +19,7 @@ class ProgressOnStderr:
 
     def __init__(self) -> None:
         self._bar: tqdm | None = None
-        self._said = time.monotonic()
+        self._said: float | None = None
 
     def __enter__(self) -> ProgressOnStderr:
         return self
@@ -31,9 +31,10 @@ class ProgressOnStderr:
         """Show where the batch stands; name a drive that failed."""
         if sys.stderr.isatty():
             self._draw(progress)
-        elif time.monotonic() - self._said > _LINE_EVERY_S:
+        elif self._said is None or time.monotonic() - self._said > _LINE_EVERY_S:
+            begun = self._said is None
             self._said = time.monotonic()
-            complain(progress_line(progress))
+            complain(first_line(progress) if begun else progress_line(progress))
         if progress.last is not None and not progress.last.has_result:
             if self._bar is not None:
                 self._bar.clear()
@@ -54,11 +55,18 @@ class ProgressOnStderr:
             self._bar = None
 
 
+def first_line(progress: Progress) -> str:
+    """What there is to do, in words."""
+    earlier = f", {progress.earlier} of them done by an earlier run" if progress.earlier else ""
+    return f"{progress.total} drives{earlier}"
+
+
 def progress_line(progress: Progress) -> str:
     """Where a batch stands, in words."""
     left = "" if progress.left_s is None else f", {_duration(progress.left_s)} left"
     failed = f", {progress.without_result} without result" if progress.without_result else ""
-    return f"{progress.done} of {progress.total} drives{failed}, {progress.per_hour:.0f} an hour{left}"
+    rate = "" if progress.left_s is None else f", {progress.per_hour:.0f} an hour"
+    return f"{progress.done} of {progress.total} drives{failed}{rate}{left}"
 
 
 def _duration(seconds: float) -> str:

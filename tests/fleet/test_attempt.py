@@ -1,0 +1,127 @@
+"""What befalls the process of one drive costs that drive alone, and what others do to it costs it nothing."""
+
+from __future__ import annotations
+
+import csv
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from sst_graph.cli import main
+from sst_graph.fleet.attempt import MOST_KILLS, Job, run_drive
+from sst_graph.fleet.drives import Drive
+from sst_graph.fleet.places import Place
+from sst_graph.fleet.record import Record
+
+FAULTS = '''
+"""Python runs this before the program: faults of a drive's process, by the drive's name."""
+import ctypes, os, pathlib, signal, sys, time
+if "calibrate" in sys.orig_argv:
+    name = pathlib.Path(sys.orig_argv[sys.orig_argv.index("calibrate") + 1]).name
+    log = pathlib.Path(__file__).with_name(name)
+    with log.open("a") as stream:
+        stream.write("x")
+    tries = log.stat().st_size
+    kind, _, times = name.partition("-")
+    if kind == "killed" and tries <= int(times):
+        os.kill(os.getpid(), signal.SIGKILL)
+    if kind == "terminated" and tries <= int(times):
+        os._exit(128 + signal.SIGTERM)
+    if kind == "alternating":
+        os.kill(os.getpid(), signal.SIGKILL if tries % 2 else signal.SIGSEGV)
+    if kind == "segfault":
+        ctypes.string_at(0)
+    if kind == "endless":
+        time.sleep(600)
+    if kind == "greedy":
+        held = []
+        while True:
+            held.append(bytearray(1 << 22))
+            time.sleep(0.002)
+'''
+
+
+@pytest.fixture
+def faults(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder in which every attempt at a drive leaves a letter in a file of the drive's name."""
+    folder = tmp_path / "faults"
+    folder.mkdir()
+    (folder / "sitecustomize.py").write_text(FAULTS)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")]))
+    return folder
+
+
+def attempted(name: str, tmp_path: Path, retries: int) -> Record:
+    """The record of a drive that does not exist: an attempt that is let run ends as bad input."""
+    job = Job(
+        Drive(name, Place(str(tmp_path / name))), (), Place(str(tmp_path / "out")), "/", retries=retries
+    )
+    return run_drive(job)
+
+
+@pytest.mark.parametrize("name", ["killed-3", "terminated-3"])
+def test_kills_from_outside_are_no_retries_of_the_drive(name: str, faults: Path, tmp_path: Path) -> None:
+    record = attempted(name, tmp_path, retries=0)
+    assert (record.status, record.cost.attempts) == ("bad_input", 4)
+    assert len((faults / name).read_text()) == 4
+
+
+def test_a_drive_that_is_always_killed_has_an_end(faults: Path, tmp_path: Path) -> None:
+    record = attempted("killed-1000", tmp_path, retries=0)
+    assert (record.status, record.cost.attempts) == ("killed", MOST_KILLS)
+    assert "ended from outside by SIGKILL" in record.reason
+    assert Record.from_json((tmp_path / "out/records/killed-1000.json").read_bytes(), "record") == record
+
+
+def test_kills_and_crashes_are_counted_apart(faults: Path, tmp_path: Path) -> None:
+    """It is killed, crashes, is killed, crashes: two crashes are one retry used up."""
+    record = attempted("alternating", tmp_path, retries=1)
+    assert (record.status, record.cost.attempts) == ("crash", 4)
+    assert "SIGSEGV" in record.reason
+
+
+def test_the_kernel_short_of_memory_is_a_crash(
+    faults: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such a drive may be what took the memory: it has its retries and no more."""
+    counts = tmp_path / "vmstat"
+    counts.write_text("nr_free_pages 12\noom_kill 4\n")
+    monkeypatch.setattr("sst_graph.fleet.isolated._KERNEL_COUNTS", str(counts))
+    changed = (
+        (faults / "sitecustomize.py")
+        .read_text()
+        .replace(
+            "os.kill(os.getpid(), signal.SIGKILL)",
+            f"pathlib.Path({str(counts)!r}).write_text(f'oom_kill {{4 + tries}}'); os.kill(os.getpid(), 9)",
+        )
+    )
+    (faults / "sitecustomize.py").write_text(changed)
+    record = attempted("killed-1000", tmp_path, retries=1)
+    assert (record.status, record.cost.attempts) == ("crash", 2)
+    assert "want of it: fewer --workers" in record.reason
+
+
+@pytest.mark.slow
+def test_each_fault_costs_its_drive_alone(kitti_drive: Path, faults: Path, tmp_path: Path) -> None:
+    drives, out = tmp_path / "drives", tmp_path / "out"
+    for name in ("segfault", "greedy", "endless", "killed-2", "fine", "bad"):
+        shutil.copytree(kitti_drive.parents[1], drives / name)
+    (drives / "bad/sequences/00/times.txt").write_text("noon")
+    command = ["batch", str(drives), "--out", str(out), "--workers", "2", "--retries", "1", "--no-report"]
+    assert main([*command, "--memory-limit", "0.8", "--time-limit", "40"]) == 3
+    with (out / "summary.csv").open(newline="") as stream:
+        rows = {row["drive"]: row for row in csv.DictReader(stream)}
+    assert {name: (row["status"], row["attempts"]) for name, row in rows.items()} == {
+        "segfault": ("crash", "2"),
+        "greedy": ("memory_limit", "1"),
+        "endless": ("time_limit", "1"),
+        "killed-2": ("unobservable", "3"),
+        "fine": ("unobservable", "1"),
+        "bad": ("bad_input", "1"),
+    }
+    assert sorted(one.name for one in (out / "drives").iterdir()) == ["fine", "killed-2"]
+    assert main(["calibrate", str(drives / "fine"), "--out", str(tmp_path / "alone"), "--no-report"]) == 3
+    for one in (tmp_path / "alone").iterdir():
+        assert one.read_bytes() == (out / "drives/fine" / one.name).read_bytes()
