@@ -194,8 +194,8 @@ def _close_ups(inputs: ReportInputs, reader: DriveReader) -> str:
         "The objects that determine the calibration most, then those whose labels agree with it least; of "
         f"each the part that determines most, {ZOOM} times enlarged. Yellow: contour of the labels, moved to "
         f"the edges of the picture. Points: where the LiDAR sees the object end, green within {CLOSE_PX:g} "
-        "px of the contour, red beyond; magenta joins each with its contour. Blue bars: how far ±2 sigma of the "
-        "calibration would move the point. Most points should lie on the yellow line."
+        "px of the contour, red beyond; magenta joins each with its contour. Blue bars: how far ±2 sigma of "
+        "the calibration would move the point. Most points should lie on the yellow line."
     )
     return section("objects", "Telling objects", paragraph(hint), grid(figures, "large")) if figures else ""
 
