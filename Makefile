@@ -10,7 +10,7 @@ WORKERS ?= 2
 # Many small matrices: threads inside NumPy and OpenCV only get in each other's way.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: setup test test-slow lint demo bench guard mutate release-check image docs lock clean
+.PHONY: setup test test-slow lint demo bench guard mutate release-check image docs browser lock clean
 
 setup: $(INSTALLED)
 
@@ -67,6 +67,11 @@ docs: $(INSTALLED)
 	$(BIN)/python docs/make_api.py > docs/reference/api.md
 	$(BIN)/python -m sphinx -W --keep-going -q -d build/doctrees docs build/site
 	@echo 'open build/site/index.html'
+
+# Chromium, in which tests/report opens a report; on Debian and its kin as root, else install it yourself.
+browser:
+	@command -v chromium || command -v chromium-browser || command -v google-chrome \
+	    || (apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends chromium)
 
 # Fresh versions of everything, in a throw-away environment.
 lock:

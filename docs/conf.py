@@ -13,6 +13,7 @@ sys.path[:0] = [str(DOCS.parent), str(DOCS)]
 import make_api  # noqa: E402
 import make_command_line  # noqa: E402
 import make_notebooks  # noqa: E402
+import make_provenance  # noqa: E402
 
 project = "sst-graph"
 author = "the sst-graph developers"
@@ -69,5 +70,12 @@ def _formulas(app: Any, what: str, name: str, obj: Any, options: Any, lines: lis
     lines[:] = [re.sub(r"(?<!\\)\|", r"\\|", line) for line in lines]
 
 
+def _origin(app: Any, docname: str, source: list[str]) -> None:
+    """Measured pages end with the commit of their tables."""
+    if docname.startswith(make_provenance.MEASURED):
+        source[0] += make_provenance.origin(DOCS / f"{docname}.md")
+
+
 def setup(app: Any) -> None:
+    app.connect("source-read", _origin)
     app.connect("autodoc-process-docstring", _formulas)

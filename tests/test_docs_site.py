@@ -11,6 +11,9 @@ from urllib.parse import unquote
 
 import pytest
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "docs"))
+import make_provenance
+
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
 REFERENCE = DOCS / "reference"
@@ -69,6 +72,57 @@ def test_the_site_needs_no_network_and_its_links_lead_somewhere(site: Path) -> N
     assert dead == []
     loaded = re.compile(r'<(?:script|img|link rel="stylesheet")[^>]*(?:src|href)="(?:https?:)?//')
     assert [path.name for path in pages if loaded.search(path.read_text(encoding="utf-8"))] == []
+
+
+@pytest.mark.slow
+def test_a_measured_page_of_the_site_names_the_commit_of_its_tables(site: Path) -> None:
+    for name in ("measured/fit", "results/accuracy", "compared/peers"):
+        page = (site / f"{name}.html").read_text(encoding="utf-8")
+        assert re.search(r"those of commit <code[^>]*>.*?[0-9a-f]{7,}", page), name
+    assert "those of commit" not in (site / "start" / "first.html").read_text(encoding="utf-8")
+
+
+COMMAND = re.compile(r"sst-graph \w+|python -m \w+|make \w+|[\w/]+\.py\b")
+"""A program that is in this repository."""
+MEASURED = [*sorted((DOCS / "measured").glob("*.md")), DOCS / "compared" / "paper.md"]
+MEASURED += [DOCS / "results" / name for name in ("accuracy.md", "ablation.md")]
+
+
+@pytest.mark.parametrize("path", MEASURED, ids=lambda path: path.stem)
+def test_a_measured_page_names_the_command_of_its_tables(path: Path) -> None:
+    page = path.read_text(encoding="utf-8")
+    code = " ".join(re.findall(r"```.*?```|`[^`]+`|\]\([^)]+\)", page, re.DOTALL))
+    assert COMMAND.search(code), "found tables, expected the command that makes them"
+    if "in a checkout of that commit" in page:  # which has programs that are no longer here
+        return
+    programs = re.findall(r"(?:benchmarks|studies|checks|docs/figures)[\w/]*\.py\b", code)
+    assert all((ROOT / program).is_file() for program in programs)
+
+
+def test_the_commit_of_tables_follows_them_alone(tmp_path: Path) -> None:
+    def git(*command: str) -> str:
+        author = ["-c", "user.name=a", "-c", "user.email=a@b"]
+        done = subprocess.run(["git", *author, *command], cwd=tmp_path, capture_output=True, check=True)
+        return done.stdout.decode().strip()
+
+    page = tmp_path / "page.md"
+    page.write_text("# Measured\n")
+    assert make_provenance.origin(page) == ""
+    git("init", "-q")
+    page.write_text("# Measured\n\n| a |\n|---|\n| 1 |\n")
+    assert make_provenance.origin(page) == ""  # not committed: no commit's figures
+    git("add", "page.md")
+    git("commit", "-qm", "measured")
+    first = git("rev-parse", "--short", "HEAD")
+    assert f"`{first}`" in make_provenance.origin(page)
+    page.write_text(page.read_text() + "\nMore words.\n")
+    git("commit", "-qam", "words")
+    assert f"`{first}`" in make_provenance.origin(page)
+    page.write_text(page.read_text().replace("| 1 |", "| 2 |"))
+    assert f"`{first}`" in (changed := make_provenance.origin(page)) and "not committed" in changed
+    git("commit", "-qam", "measured again")
+    second = git("rev-parse", "--short", "HEAD")
+    assert f"`{second}`" in (now := make_provenance.origin(page)) and "not committed" not in now
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)

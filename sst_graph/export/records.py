@@ -26,8 +26,8 @@ FloatArray = NDArray[np.float64]
 def kitti(rig: Rig) -> str:
     """KITTI odometry ``calib.txt``: P lines, and Tr: the LiDAR in the rectified camera **0**.
 
-    uv1 ~ PN [Tr; 0 0 0 1] lP1, so that for camera N Tr = [I | K^-1 PN[:, 3]]^-1 T_camera_lidar. The
-    format has no comments and no time offset.
+    uv1 ~ PN [Tr; 0 0 0 1] lP1, so that for camera N Tr = [I | K^-1 PN[:, 3]]^-1 T_camera_lidar. Readers
+    take every line for numbers, so the file has no comments and no time offset.
     """
     result = _only(rig, "kitti", "its one Tr goes with one camera")
     calibration = rig.options.kitti
@@ -37,8 +37,9 @@ def kitti(rig: Rig) -> str:
     else:
         camera = result.camera_name.removeprefix("image_").lstrip("0") or "0"
         own = int(camera) if re.fullmatch(r"\d", camera) else 0
+        # One camera is known, and stands for all: pykitti wants four.
         P = np.hstack([result.camera.matrix, np.zeros((3, 1))])
-        projections = {number: P for number in sorted({0, own})}
+        projections = dict.fromkeys(sorted({0, 1, 2, 3, own}), P)
         c0Tl = result.T_camera_lidar
     lines = [f"P{number}: {row(matrix)}" for number, matrix in sorted(projections.items())]
     return "\n".join([*lines, f"Tr: {row(c0Tl.matrix()[:3])}"]) + "\n"

@@ -30,13 +30,12 @@ _PARTS = 3
 """Parts of the record in each of which an object may be shown."""
 _LEAST_POINTS = 12
 """Fewest boundary points of an object that is shown."""
-_MOST_ZOOM, _LEAST_ZOOM = 8, 4
-"""Enlargement: as much as the object leaves room for; of a large one, the part that determines most is
-shown."""
-_WIDTH, _HEIGHT = 480, 360
+ZOOM = 8
+"""Enlargement: of an object that is larger, the part that determines most is shown."""
+_WIDTH, _HEIGHT = 416, 312
 """Size of a close-up [px of the page]."""
-_MARGIN_PX = 8.0
-"""Picture around the object [px]."""
+_MARGIN_PX = 4.0
+"""Picture around the points that are shown [px]."""
 _SIDE_NAMES = ("left", "right", "top", "bottom")
 
 
@@ -127,7 +126,7 @@ def _close_up(
     uvs, _ = project_points(drawn, points, placements.after)
     moves = _two_sigma_moves(drawn, points, placements, result)
     crop = _Crop.around(uvs, _leverages(points, result.covariance), drawn.image.pixels)
-    picture, zoom = crop.enlarged(drawn.image.pixels), crop.zoom
+    picture = crop.enlarged(drawn.image.pixels)
     class_name = SemanticClass(int(points.classes[0])).name.lower().replace("_", " ")
     r = points.residuals_px
     size = float(np.median(np.abs(r)))
@@ -138,18 +137,19 @@ def _close_up(
     sides = ", ".join(
         f"{_SIDE_NAMES[side]} {np.mean(r[points.sides == side]):+.1f} px" for side in np.unique(points.sides)
     )
+    column, row = (0.5 * np.array([crop.left + crop.right, crop.top + crop.bottom])).astype(int)
     caption = (
         f"{size:.1f} px from the contour (median of {len(r)} points; {sides}), "
         f"{100.0 * np.mean(np.abs(r) < CLOSE_PX):.0f} % within {CLOSE_PX:g} px. ±2 sigma of the calibration "
-        f"moves it by ±{reach:.1f} px. {drawn.frame.drive}, image {drawn.frame.image}, {zoom:.2g} times "
-        f"enlarged; {100.0 * detection.share:.1f} % of the information."
+        f"moves it by ±{reach:.1f} px. {100.0 * detection.share:.1f} % of the information. "
+        f"{drawn.frame.drive}, image {drawn.frame.image}, about column {column}, row {row}."
     )
     width, height = picture.shape[1], picture.shape[0]
     marks = [
         f'<path class="contour" d="{_contour_path(drawn, SemanticClass(int(points.classes[0])), crop)}"/>'
     ]
     for (u, v), (du, dv), (x, y), value in zip(
-        crop.places(uvs), zoom * moves, crop.places(points.pixels), r, strict=True
+        crop.places(uvs), ZOOM * moves, crop.places(points.pixels), r, strict=True
     ):
         colour = "good" if abs(value) < CLOSE_PX else "bad"
         marks.append(f'<path class="spread" d="M{u - du:.1f} {v - dv:.1f}L{u + du:.1f} {v + dv:.1f}"/>')
@@ -195,44 +195,33 @@ class _Crop:
 
     Attributes:
         left, top, right, bottom: columns and rows, the last ones not included.
-        zoom: enlargement.
     """
 
     left: int
     top: int
     right: int
     bottom: int
-    zoom: float
 
     @classmethod
     def around(cls, uvs: FloatArray, importance: FloatArray, pixels: NDArray[np.uint8]) -> _Crop:
-        """Points (n, 2) with what is around them, in the shape of a close-up; the most important (n,) of
-        many."""
-        rows, columns = pixels.shape[:2]
-        room = 0.5 * np.array([_WIDTH, _HEIGHT]) / _LEAST_ZOOM - _MARGIN_PX
-        near = np.asarray((np.abs(uvs[:, None] - uvs[None]) <= room).all(axis=2))
-        if not near.all():
-            uvs = uvs[near[int(np.argmax(near @ importance))]]
-        low, high = np.nanmin(uvs, axis=0) - _MARGIN_PX, np.nanmax(uvs, axis=0) + _MARGIN_PX
-        width, height = np.maximum(high - low, [_WIDTH / _MOST_ZOOM, _HEIGHT / _MOST_ZOOM])
-        width = max(width, height * _WIDTH / _HEIGHT)
-        size = np.array([width, width * _HEIGHT / _WIDTH])
-        first = np.floor(0.5 * (low + high) - 0.5 * size).astype(int)
-        last = np.ceil(0.5 * (low + high) + 0.5 * size).astype(int)
-        left, top = np.clip(first, 0, [columns - 2, rows - 2]).tolist()
-        right, bottom = np.clip(last, [left + 2, top + 2], [columns, rows]).tolist()
-        zoom = min(float(_MOST_ZOOM), _WIDTH / (right - left))
-        return cls(left, top, right, bottom, round(zoom, 2))
+        """Points (n, 2) with what is around them, in the size of a close-up; the most important (n,) where
+        they are more than that."""
+        size = np.array([_WIDTH, _HEIGHT]) // ZOOM
+        near = np.asarray((np.abs(uvs[:, None] - uvs[None]) <= 0.5 * size - _MARGIN_PX).all(axis=2))
+        shown = uvs[near[int(np.argmax(near @ importance))]]
+        last = np.maximum(np.array(pixels.shape[1::-1]) - size, 0)
+        middle = 0.5 * (np.nanmin(shown, axis=0) + np.nanmax(shown, axis=0))
+        left, top = np.clip(np.round(middle - 0.5 * size).astype(int), 0, last).tolist()
+        right, bottom = np.minimum(np.array([left, top]) + size, pixels.shape[1::-1]).tolist()
+        return cls(left, top, right, bottom)
 
     def enlarged(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         part = pixels[self.top : self.bottom, self.left : self.right]
-        size = round(self.zoom * part.shape[1]), round(self.zoom * part.shape[0])
-        way = cv2.INTER_CUBIC if self.zoom > 1.0 else cv2.INTER_AREA
-        return np.asarray(cv2.resize(part, size, interpolation=way), np.uint8)
+        return np.asarray(cv2.resize(part, None, fx=ZOOM, fy=ZOOM, interpolation=cv2.INTER_CUBIC), np.uint8)
 
     def places(self, uvs: FloatArray) -> FloatArray:
         """(n, 2) where pixels lie in the close-up."""
-        return np.asarray(self.zoom * (uvs + 0.5 - [self.left, self.top]))
+        return np.asarray(ZOOM * (uvs + 0.5 - [self.left, self.top]))
 
 
 def _contour_path(drawn: DrawnFrame, semantic_class: SemanticClass, crop: _Crop) -> str:

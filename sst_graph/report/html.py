@@ -42,10 +42,10 @@ def figure(content: str, title: str, caption: str) -> str:
     )
 
 
-def grid(figures: Sequence[str]) -> str:
+def grid(figures: Sequence[str], kind: str = "") -> str:
     """Figures beside each other where there is room."""
     shown = [one for one in figures if one]
-    return '<div class="grid">' + "\n".join(shown) + "</div>" if shown else ""
+    return f'<div class="{f"grid {kind}".strip()}">' + "\n".join(shown) + "</div>" if shown else ""
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:

@@ -13,12 +13,12 @@ import numpy as np
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.fit import CLOSE_PX, Fit, FitQuality, MatchedFrame
 from sst_graph.inspect.budget_text import budget_lines
-from sst_graph.inspect.inspection import Inspection, inspect_result
+from sst_graph.inspect.inspection import Inspection, inspect_result, strong_correlations
 from sst_graph.inspect.inspection_text import MOST_SENTENCES, advice_sentences, correlation_sentence
 from sst_graph.inspect.reasons import short_reasons
 from sst_graph.inspect.report import Comparison, error_lines, summary
 from sst_graph.inspect.verdict import DRIVING_MPS, figure, misfits, quality_line, verdict
-from sst_graph.report.close_ups import close_ups
+from sst_graph.report.close_ups import ZOOM, close_ups
 from sst_graph.report.drawn_frame import DrawnFrame, DriveReader
 from sst_graph.report.html import (
     bullets,
@@ -192,14 +192,13 @@ def _close_ups(inputs: ReportInputs, reader: DriveReader) -> str:
         return ""
     figures = close_ups(fit, inputs.result, lambda drive: _placements(inputs.result, drive), reader)
     hint = (
-        "The objects that determine the calibration most, then those whose labels agree with it least. "
-        "Yellow: contour of the labels, moved to the edges of the picture. Points: where the LiDAR sees the "
-        f"object end, green within {CLOSE_PX:g} px of the contour, red beyond; magenta joins each with its "
-        "contour. Blue bars: how far ±2 sigma of the calibration would move the point. Most points "
-        "should lie "
-        "on the yellow line."
+        "The objects that determine the calibration most, then those whose labels agree with it least; of "
+        f"each the part that determines most, {ZOOM} times enlarged. Yellow: contour of the labels, moved to "
+        f"the edges of the picture. Points: where the LiDAR sees the object end, green within {CLOSE_PX:g} "
+        "px of the contour, red beyond; magenta joins each with its contour. Blue bars: how far ±2 sigma of "
+        "the calibration would move the point. Most points should lie on the yellow line."
     )
-    return section("objects", "Telling objects", paragraph(hint), grid(figures)) if figures else ""
+    return section("objects", "Telling objects", paragraph(hint), grid(figures, "large")) if figures else ""
 
 
 def _residuals(result: CalibrationResult) -> str:
@@ -243,7 +242,7 @@ def _background(inputs: ReportInputs, inspection: Inspection) -> str:
         "<h3>Correlations (about and along the LiDAR's axes)</h3>",
         correlation_table(result),
         bullets(sentences),
-        grid(ellipse_charts(result, inspection.strong)),
+        grid(ellipse_charts(result, strong_correlations(result.covariance, 0.0))),
         details("Settings", preformatted(json.dumps(_plain(result.config), indent=1))),
         details("How the drives were read", preformatted(json.dumps(_plain(result.read_as), indent=1)))
         if result.read_as
@@ -262,18 +261,19 @@ def _assumptions(result: CalibrationResult) -> str:
     ]
     if not rows:
         return ""
-    return "<h3>Assumptions</h3>" + table(("assumption", "by the data", "considered", "verdict"), rows)
+    head = ("assumption", "by the data", "considered", "verdict", "what it would mean if it did not hold")
+    return "<h3>Assumptions</h3>" + table(head, rows)
 
 
-def _assumption_row(name: str, entry: Mapping[str, Any]) -> tuple[str, str, str, str]:
+def _assumption_row(name: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
     unit = ASSUMPTIONS[name].unit
     estimate, spread, considered = (entry.get(key) for key in ("estimate", "estimate_sigma", "sigma"))
     tested = isinstance(estimate, int | float) and isinstance(spread, int | float)
     found = ASSUMPTIONS[name].figure(float(estimate), float(spread)) if tested else "not tested"  # type: ignore[arg-type]
     part = f"±{considered:.2g} {unit}".rstrip() if isinstance(considered, int | float) else ""
-    if entry.get("contradicted"):
-        return name, found, part, f"contradicted: {ASSUMPTIONS[name].remedy}"
-    return name, found, part, "holds" if tested else "its effect is in the sigmas"
+    held = "holds" if tested else "its effect is in the sigmas"
+    said = f"contradicted: {ASSUMPTIONS[name].remedy}" if entry.get("contradicted") else held
+    return name, found, part, said, ASSUMPTIONS[name].violation
 
 
 def _plain(value: Any) -> Any:

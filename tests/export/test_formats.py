@@ -58,6 +58,21 @@ def test_kitti_by_the_odometry_class_of_pykitti(kitti_drive: Path) -> None:
     np.testing.assert_allclose(found.T_cam2_velo, result.T_camera_lidar.matrix(), atol=1e-12)
 
 
+def test_kitti_of_one_camera_by_the_odometry_class_of_pykitti(kitti_drive: Path) -> None:
+    result = result_of(FORWARD, [0.01, -0.08, -0.27])
+    (kitti_drive / "calib.txt").write_text(export_text(result, "kitti"))
+    found = pykitti.odometry(str(kitti_drive.parents[1]), "00").calib
+    np.testing.assert_allclose(found.T_cam2_velo, result.T_camera_lidar.matrix(), atol=1e-12)
+
+
+def test_every_format_but_kitti_states_the_sign_of_the_time_offset() -> None:
+    """Readers of calib.txt take every line for numbers; the command says it on stderr."""
+    result = result_of(FORWARD, [0.01, -0.08, -0.27])
+    for name in set(FORMATS) - {"kitti"}:
+        text = export_text(result, name)
+        assert "t_lidar = t_camera_stamp + time_offset_s" in text, name
+
+
 def test_kitti_by_hand(tmp_path: Path) -> None:
     # P2's fourth column 35 at fx = 700 puts camera 0 at x = +5 cm in camera 2
     original = tmp_path / "calib.txt"

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import html
 import html.parser
 import json
+import os
 import re
 import shutil
 import subprocess
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -18,6 +21,7 @@ from stored import stored
 from streets import CROWDED_STREET, crowded_street
 
 from sst_graph import CalibrationConfig, calibrate
+from sst_graph.assumptions.focal_length import FOCAL
 from sst_graph.fit import Fit
 from sst_graph.inspect.verdict import verdict
 from sst_graph.report import ReportInputs, report_html
@@ -119,35 +123,61 @@ def test_nothing_is_loaded_from_elsewhere() -> None:
     assert not re.search(r"https?:|@import|url\(|fetch\(|XMLHttp|WebSocket", _page())
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium")
-@pytest.mark.parametrize("width", [400, 1400])
-def test_a_browser_runs_the_page_without_an_error(tmp_path: Path, width: int) -> None:
-    """And its script has made the controls of each picture; nothing is wider than the window."""
-    probe = (
-        "<script>addEventListener('load', () => setTimeout(() => { document.title = JSON.stringify({"
-        "wide: document.documentElement.scrollWidth, window: innerWidth, "
-        "drawn: [...document.querySelectorAll('canvas')].map(c => { const d = c.getContext('2d')"
-        ".getImageData(0, 0, c.width, c.height).data; return new Set(d).size; })}); }, 500))</script>"
-    )
-    page = tmp_path / "report.html"
-    page.write_text(_page() + probe, encoding="utf-8")
-    command = [str(CHROMIUM), "--headless=new", "--no-sandbox", "--disable-gpu", f"--window-size={width},900"]
-    command += [
-        f"--user-data-dir={tmp_path}/profile",
-        "--enable-logging=stderr",
-        "--virtual-time-budget=5000",
-    ]
+PROBE = (
+    "<script>addEventListener('load', () => setTimeout(() => { parent.document.title = JSON.stringify({"
+    "wide: document.documentElement.scrollWidth, window: innerWidth, "
+    "back: getComputedStyle(document.body).backgroundColor, "
+    "drawn: [...document.querySelectorAll('canvas')].map(c => { const d = c.getContext('2d')"
+    ".getImageData(0, 0, c.width, c.height).data; return new Set(d).size; }), "
+    "sliders: document.querySelectorAll('input[type=range]').length}); }, 500))</script>"
+)
+"""Tells the outer page what the report has become."""
+
+
+def _opened(folder: Path, width: int, dark: bool) -> tuple[dict[str, Any], str]:
+    """What the probe found in a browser, and the browser's log.
+
+    The report stands in a frame: a window is 500 px wide at least.
+    """
+    outer = folder / "outer.html"
+    style, inner = f"width:{width}px;height:900px;border:0", html.escape(_page() + PROBE)
+    outer.write_text(f'<iframe style="{style}" srcdoc="{inner}"></iframe>', encoding="utf-8")
+    command = [str(CHROMIUM), "--headless", "--no-sandbox", "--disable-gpu", "--window-size=1500,1000"]
+    command += [f"--user-data-dir={folder}/profile", "--enable-logging=stderr", "--virtual-time-budget=5000"]
+    command += ["--blink-settings=preferredColorScheme=0"] if dark else []
     done = subprocess.run(
-        [*command, "--dump-dom", page.as_uri()], capture_output=True, text=True, timeout=120
+        [*command, "--dump-dom", outer.as_uri()], capture_output=True, text=True, timeout=120
     )
     assert done.returncode == 0, done.stderr
-    assert [line for line in done.stderr.splitlines() if "CONSOLE" in line] == []
     title = re.search(r"<title>(\{.*?\})</title>", done.stdout)
-    assert title, "the script of the page did not run"
-    seen = json.loads(title[1])
-    assert seen["wide"] <= seen["window"]
-    assert len(seen["drawn"]) == 3 and min(seen["drawn"]) > 50
-    assert done.stdout.count('type="range"') == 3
+    assert title, f"the script of the page did not run\n{done.stderr}"
+    return json.loads(title[1]), done.stderr
+
+
+def test_a_browser_is_there_where_it_must_be() -> None:
+    """``.ci/run`` installs one and says so: there the next test cannot be skipped."""
+    assert CHROMIUM is not None or os.environ.get("SST_GRAPH_BROWSER") != "required"
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium")
+@pytest.mark.parametrize(("width", "dark"), [(400, False), (400, True), (1400, False), (1400, True)])
+def test_a_browser_runs_the_page_without_an_error(tmp_path: Path, width: int, dark: bool) -> None:
+    """And its script has made the controls of each picture; nothing is wider than the window."""
+    seen, log = _opened(tmp_path, width, dark)
+    assert [line for line in log.splitlines() if "CONSOLE" in line] == []
+    assert seen["window"] == width and seen["wide"] <= width
+    assert seen["back"] == ("rgb(20, 23, 27)" if dark else "rgb(255, 255, 255)")
+    assert len(seen["drawn"]) == seen["sliders"] == 3 and min(seen["drawn"]) > 50
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium")
+def test_an_error_of_a_script_would_be_seen(tmp_path: Path) -> None:
+    page = tmp_path / "broken.html"
+    page.write_text("<script>nothing.such()</script>")
+    command = [str(CHROMIUM), "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr"]
+    command += [f"--user-data-dir={tmp_path}/profile", "--dump-dom", page.as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert "CONSOLE" in done.stderr and "nothing is not defined" in done.stderr
 
 
 def test_names_of_the_data_are_text() -> None:
@@ -218,3 +248,18 @@ def test_the_telling_objects_are_different_ones_first() -> None:
     assert len(set(tracks[:several])) == several
     assert all(len(np.unique(fit.points.frames[one.points])) == 1 for one in chosen)
     assert sum(one.share for one in chosen) < 1.0
+
+
+def test_close_ups_are_eight_times_enlarged() -> None:
+    """52 by 39 pixels of the picture, each 8 px of the page, which a column of the page has room for."""
+    found = re.findall(r'class="closeup" viewBox="0 0 (\d+) (\d+)"', _page())
+    assert len(found) >= 3 and set(found) == {("416", "312")}
+    for picture in re.findall(r'class="closeup".*?</svg>', _page(), re.DOTALL):
+        at = np.array(re.findall(r'cx="([-\d.]+)" cy="([-\d.]+)"', picture), np.float64)
+        assert ((at >= 0.0) & (at <= [416.0, 312.0])).all(axis=1).sum() >= 5
+
+
+def test_three_ellipses_and_the_meaning_of_each_assumption() -> None:
+    assert len(re.findall(r"Ellipses of ", _page())) == 3
+    (table,) = re.findall(r"<h3>Assumptions</h3>.*?</table>", _page(), re.DOTALL)
+    assert FOCAL.violation in table and len(re.findall(r"<tr>", table)) >= 10

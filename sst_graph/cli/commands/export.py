@@ -5,11 +5,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from sst_graph.cli.messages import complain, mention, say
+from sst_graph.cli.messages import complain, loudness, mention, say
 from sst_graph.cli.outputs import check_apart
 from sst_graph.data.kitti.calib import read_calibration
 from sst_graph.errors import ConfigError
 from sst_graph.export import ExportOptions, export_text
+from sst_graph.export.text import heading
 from sst_graph.files import output_file
 from sst_graph.imports import read_tree
 from sst_graph.result import CalibrationResult, read_result, result_file
@@ -49,7 +50,11 @@ def _text(args: argparse.Namespace) -> str:
         None if args.tree is None else read_tree(args.tree),
         None if args.calib is None else read_calibration(args.calib),
     )
-    return export_text(result, args.to, options)
+    text = export_text(result, args.to, options)
+    if args.to == "kitti" and isinstance(result, CalibrationResult) and not loudness.quiet:
+        offset = heading(result, result.camera_name)[0]
+        complain(f"note: calib.txt has no place for the time offset: {offset}")
+    return text
 
 
 def _result(path: Path) -> CalibrationResult | RigResult:
