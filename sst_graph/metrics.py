@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
+from sst_graph.files.checked_values import MAX_SIGMA
 from sst_graph.types import GroundTruth
 
 FloatArray = NDArray[np.float64]
@@ -54,8 +55,8 @@ class TruthSigma:
 
     def __post_init__(self) -> None:
         for name in ("rotation_deg", "translation_m", "time_offset_s"):
-            if not 0.0 <= getattr(self, name) < np.inf:
-                raise DataError(f"truth sigma: {name}", f"{getattr(self, name):g}", "0 or more")
+            if not 0.0 <= getattr(self, name) <= MAX_SIGMA:
+                raise DataError(f"truth sigma: {name}", f"{getattr(self, name):g}", f"0 to {MAX_SIGMA:g}")
 
     @property
     def covariance(self) -> FloatArray:

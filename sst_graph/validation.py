@@ -7,14 +7,17 @@ fits; everything else is refused with what was found and what was expected.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.types import NO_PICTURE, CameraImage, Scan, SemanticClass
+from sst_graph.files.checked_values import checked_camera, checked_pose, checked_time_offset_s
+from sst_graph.types import NO_PICTURE, CameraImage, Frame, PixelStretch, Scan, SemanticClass
 
 MOST_POINTS = 10_000_000
 """Points of a scan; ten times what the densest spinning LiDAR gives in a sweep."""
@@ -24,6 +27,9 @@ LONGEST_SWEEP_S = 2.0
 """Times of points are relative to the scan's stamp; a larger one is an absolute time [s]."""
 LATEST_NS = 2**62
 """Stamps lie within +-146 years of zero, so that no difference of two leaves int64 [ns]."""
+
+MOST_STRETCH = 1e6
+"""No lens enlarges pixels more where an image is rectified."""
 
 _IS_CLASS = np.isin(np.arange(256), [int(c) for c in SemanticClass])
 
@@ -88,7 +94,82 @@ def checked_image(image: object, camera: PinholeCamera, place: str = "image") ->
         valid = _array(valid, size, f"{place}: valid", "the camera's size")
         if valid.dtype != np.bool_:
             raise DataError(f"{place}: valid", f"dtype {valid.dtype}", "bool")
-    return CameraImage(stamp_ns, mask, np.ascontiguousarray(pixels), instances, valid, image.stretch)
+    stretch = None if image.stretch is None else _stretch(image.stretch, f"{place}: stretch")
+    return CameraImage(stamp_ns, mask, np.ascontiguousarray(pixels), instances, valid, stretch)
+
+
+def checked_frame(frame: object, place: str = "frame") -> Frame:
+    """A frame with an index and its two parts, which are not looked into.
+
+    Raises:
+        DataError: something else, or an index that is no whole number.
+    """
+    if not isinstance(frame, Frame):
+        raise DataError(place, f"a {type(frame).__name__}", "a Frame")
+    if not isinstance(frame.index, int | np.integer) or isinstance(frame.index, bool):
+        raise DataError(place, f"an index that is a {type(frame.index).__name__}", "a whole number")
+    if abs(int(frame.index)) > LATEST_NS:
+        raise DataError(place, "an index of more than 19 digits", "a number of a frame")
+    return Frame(int(frame.index), frame.scan, frame.image)
+
+
+def checked_intrinsics(camera: object, place: str = "camera") -> PinholeCamera:
+    """A camera of plain numbers that go with the size of its image.
+
+    Raises:
+        DataError: something else, or as :func:`sst_graph.files.checked_values.checked_camera`.
+    """
+    if not isinstance(camera, PinholeCamera):
+        raise DataError(place, f"a {type(camera).__name__}", "a PinholeCamera")
+    for name in ("width", "height"):
+        side = getattr(camera, name)
+        if not isinstance(side, int | np.integer) or isinstance(side, bool):
+            raise DataError(f"{place}: {name}", f"a {type(side).__name__}", "a whole number of pixels")
+    fx, fy, cx, cy = (_number(getattr(camera, name), f"{place}: {name}") for name in ("fx", "fy", "cx", "cy"))
+    return checked_camera(PinholeCamera(fx, fy, cx, cy, int(camera.width), int(camera.height)), place)
+
+
+def checked_guess(initial: object, time_offset_s: object) -> tuple[gtsam.Pose3 | None, float]:
+    """A guess of cTl, or None, and one of the time offset [s].
+
+    Raises:
+        DataError: no pose, no finite number, or no pose of two sensors on one vehicle.
+    """
+    offset = checked_time_offset_s(_number(time_offset_s, "initial time offset"), "initial time offset")
+    if initial is None:
+        return None, offset
+    if not isinstance(initial, gtsam.Pose3):
+        raise DataError("initial", f"a {type(initial).__name__}", "a gtsam.Pose3, or None")
+    # As it is, and not made orthonormal anew: the same guess gives the same bits.
+    checked_pose(np.asarray(initial.matrix()), "initial")
+    return initial, offset
+
+
+def _number(value: object, place: str) -> float:
+    """A finite number as a plain float."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        raise DataError(place, f"a {type(value).__name__}", "a number")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise DataError(place, f"{number}", "a finite number")
+    return number
+
+
+def _stretch(stretch: object, place: str) -> PixelStretch:
+    """Of a rectified image: a grid of at least 2x2 places, and a whole step."""
+    if not isinstance(stretch, PixelStretch):
+        raise DataError(place, f"a {type(stretch).__name__}", "a PixelStretch")
+    squares = _array(stretch.squares, (None, None, 3), f"{place}: squares")
+    if min(squares.shape[:2]) < 2:
+        raise DataError(f"{place}: squares", f"shape {squares.shape}", "at least 2 rows and columns")
+    step = stretch.step_px
+    if not isinstance(step, int | np.integer) or isinstance(step, bool) or not 1 <= step <= LATEST_NS:
+        raise DataError(f"{place}: step_px", f"{step!r:.60}", "a whole number of pixels, 1 or more")
+    checked = _reals(squares, MOST_STRETCH**2, f"{place}: squares", "px^2 a px^2")
+    return stretch if checked is stretch.squares and type(step) is int else PixelStretch(checked, int(step))
 
 
 def _check_size(array: object, size: tuple[int, int], what: str, place: str) -> None:

@@ -365,6 +365,105 @@ def sheared(drive: KeptDrive, pixels: float) -> KeptDrive:
     )
 
 
+# ---------------------------------------------------------------------- further ones
+
+
+def mirrored_masks(drive: KeptDrive) -> KeptDrive:
+    """Masks mirrored, the pictures not: a network that was fed flipped pictures."""
+    return drive.with_images(
+        lambda i: replace(
+            i,
+            mask=np.ascontiguousarray(i.mask[:, ::-1]),
+            instances=None if i.instances is None else np.ascontiguousarray(i.instances[:, ::-1]),
+        )
+    )
+
+
+def next_masks(drive: KeptDrive) -> KeptDrive:
+    """Each image under the mask of the one after it."""
+    images = [f.image for f in drive.frames]
+
+    def masked(k: int, image: CameraImage) -> CameraImage:
+        after = images[min(k + 1, len(images) - 1)] or image
+        return replace(image, mask=after.mask, instances=after.instances)
+
+    return with_numbered_images(drive, masked)
+
+
+def another_epoch(drive: KeptDrive, seconds: int) -> KeptDrive:
+    """The camera counts from another instant than the LiDAR, and so the truth."""
+    later = drive.with_images(lambda i: replace(i, stamp_ns=i.stamp_ns + seconds * 10**9))
+    truth = drive.truth
+    if truth is None or truth.time_offset_s is None:
+        return later
+    return replace(later, truth=replace(truth, time_offset_s=truth.time_offset_s - seconds))
+
+
+def reordered_rings(drive: KeptDrive) -> KeptDrive:
+    """Laser numbers in the order of another scanner."""
+    order = np.random.default_rng(5).permutation(4096).astype(np.uint16)
+    return drive.with_scans(lambda s: s if s.rings is None else replace(s, rings=order[s.rings % 4096]))
+
+
+def hurried_scans(drive: KeptDrive) -> KeptDrive:
+    """Every second scan, under the stamps of the scans from the first one on."""
+    scans = [f.scan for f in drive.frames if f.scan is not None]
+    frames = []
+    for k, frame in enumerate(drive.frames):
+        there = frame.scan is not None and 2 * k < len(scans)
+        scan = replace(scans[2 * k], stamp_ns=frame.scan.stamp_ns) if there and frame.scan else None
+        frames.append(replace(frame, scan=scan))
+    return replace(drive, frames=tuple(frames))
+
+
+def labelled_on_one_side(drive: KeptDrive) -> KeptDrive:
+    """Masks whose right half is background: tiles that were never joined."""
+
+    def half(image: CameraImage) -> CameraImage:
+        mask = image.mask.copy()
+        mask[:, mask.shape[1] // 2 :] = SemanticClass.OTHER
+        return replace(image, mask=mask)
+
+    return drive.with_images(half)
+
+
+def turned_about_x(drive: KeptDrive, degrees: float) -> KeptDrive:
+    """The clouds are turned about their x axis."""
+    R = gtsam.Rot3.Rx(np.radians(degrees)).matrix()
+    return drive.with_scans(lambda s: replace(s, points=(s.points @ R.T).astype(np.float32)))
+
+
+def binned_pictures(drive: KeptDrive, left: int) -> KeptDrive:
+    """Pictures and masks begin some columns farther left, as those of another mode of the sensor."""
+
+    def moved(array: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return np.ascontiguousarray(np.roll(array, left, axis=1))
+
+    return drive.with_images(lambda i: replace(i, mask=moved(i.mask), pixels=moved(i.pixels), instances=None))
+
+
+def of_another_day(drive: KeptDrive) -> KeptDrive:
+    """Intrinsics as of another recording day: focal length +0.2 %, principal point 2.5 and 10.5 px away."""
+    camera = drive.camera
+    other = replace(
+        camera, fx=1.002 * camera.fx, fy=1.002 * camera.fy, cx=camera.cx - 2.5, cy=camera.cy + 10.5
+    )
+    return replace(drive, camera=other)
+
+
+def raised_lidar(drive: KeptDrive, metres: float) -> KeptDrive:
+    """The mount of the LiDAR slips by so much along its z axis in the middle of the drive."""
+    middle = len(drive) // 2
+    step = np.array([0.0, 0.0, metres], np.float32)
+    return with_numbered_scans(drive, lambda k, s: s if k < middle else replace(s, points=s.points - step))
+
+
+def half_compensated(drive: KeptDrive, seconds: float) -> KeptDrive:
+    """Scans named by the start of their turn, not by its middle; the truth stays that of the middle."""
+    early = round(1e9 * seconds)
+    return with_numbered_scans(drive, lambda k, s: replace(s, stamp_ns=s.stamp_ns - early))
+
+
 SUBTLE_FAULTS: dict[str, SubtleFault] = {
     "every second picture repeated": repeated_pictures,
     "every second scan repeated": repeated_scans,
@@ -398,6 +497,18 @@ SUBTLE_FAULTS: dict[str, SubtleFault] = {
     "dashboard, labelled background": lambda d: with_dashboard(d, False),
     "watermark": with_watermark,
     "pictures sheared by 6 px": lambda d: sheared(d, 6.0),
+    "masks mirrored, pictures not": mirrored_masks,
+    "masks one frame early": next_masks,
+    "camera in another epoch": lambda d: another_epoch(d, 37),
+    "laser numbers reordered": reordered_rings,
+    "every second scan, stamps of all": hurried_scans,
+    "masks of the left half only": labelled_on_one_side,
+    "clouds turned by 90 deg about x": lambda d: turned_about_x(d, 90.0),
+    "pictures 15 columns to the right": lambda d: binned_pictures(d, 15),
+    "intrinsics of another day": of_another_day,
+    "LiDAR slips by 10 cm in the middle": lambda d: raised_lidar(d, 0.1),
+    "LiDAR tilted by 1 deg in the middle": lambda d: knocked(d, 1.0),
+    "scans stamped 50 ms early": lambda d: half_compensated(d, 0.05),
 }
 
 SUBTLE_NAMED: dict[str, str] = {

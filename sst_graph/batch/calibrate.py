@@ -37,6 +37,7 @@ from sst_graph.batch.part_solver import PartSolver
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate, JointOutcome
 from sst_graph.batch.sources import as_sources
 from sst_graph.batch.total_covariance import total_covariance
+from sst_graph.config import expect_settings
 from sst_graph.covariance.considered import BUDGET
 from sst_graph.drive.geometric_labels import GeometricallyLabelled
 from sst_graph.drive.preparation import Drive, PrepareConfig, Progress, prepare_drive
@@ -44,6 +45,7 @@ from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.odometry.sweep import with_sweep
 from sst_graph.result import CalibrationResult
 from sst_graph.types import SemanticClass, Source
+from sst_graph.validation import checked_guess
 
 
 def calibrate(
@@ -72,7 +74,8 @@ def calibrate(
         ConfigError: the settings contradict each other or the data.
     """
     sources = as_sources(frames)
-    config = with_method_for(config or CalibrationConfig(), sources)
+    initial, initial_time_offset_s = checked_guess(initial, initial_time_offset_s)
+    config = with_method_for(expect_settings(config, CalibrationConfig), sources)
     _check(sources, config)
     began = time.perf_counter()
     drives = prepare_drives(sources, config, progress)

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import islice
 from typing import Any
 
 from sst_graph.errors import DataError
 from sst_graph.types import Source
+from sst_graph.validation import checked_intrinsics
+
+_MOST = 10_000
+"""Drives of one calibration."""
 
 
 def as_sources(frames: Source | Sequence[Source]) -> list[Source]:
@@ -15,13 +20,17 @@ def as_sources(frames: Source | Sequence[Source]) -> list[Source]:
     Raises:
         DataError: neither a source nor a sequence of sources with at least one frame each.
     """
-    sources: list[Any] = [frames] if _is_source(frames) else list(frames)
+    sources: list[Any] = [frames]
+    if not _is_source(frames):
+        # What is endless is no sequence of drives.
+        sources = list(islice(frames, _MOST)) if isinstance(frames, Iterable) else []
     if not sources or not all(_is_source(source) for source in sources):
         found = type(frames).__name__ if not sources else f"a sequence of {type(sources[0]).__name__}"
         raise DataError("frames to calibrate", found, "a source (open_source), a slice of one, or several")
     for source in sources:
         if len(source) == 0:
             raise DataError(source.name, "no frame", "one or more")
+        checked_intrinsics(source.camera, f"{source.name}: camera")
     return sources
 
 

@@ -17,12 +17,13 @@ from __future__ import annotations
 
 from sst_graph.config.ranges import Bounds, Range, internal, setting
 from sst_graph.config.reading import from_dict, read_config, with_overrides
-from sst_graph.config.settings import Settings, settings_fields, to_dict, walk_settings
+from sst_graph.config.settings import Settings, expect_settings, settings_fields, to_dict, walk_settings
 
 __all__ = [
     "Bounds",
     "Range",
     "Settings",
+    "expect_settings",
     "from_dict",
     "internal",
     "read_config",

@@ -7,11 +7,13 @@ import enum
 import functools
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 from sst_graph.config.ranges import Range, is_internal, unit_of
 from sst_graph.config.values import checked
 from sst_graph.errors import ConfigError, SstGraphError
+
+T = TypeVar("T")
 
 
 class Settings:
@@ -67,6 +69,19 @@ def _check_fields(config: Any) -> None:
         place = f"{type(config).__name__}.{field.name}"
         value = checked(hint, getattr(config, field.name), place, Range.of(field))
         object.__setattr__(config, field.name, value)
+
+
+def expect_settings(config: T | None, cls: type[T]) -> T:
+    """Settings that are given, or the defaults where None is.
+
+    Raises:
+        ConfigError: something else is given.
+    """
+    if config is None:
+        return cls()
+    if not isinstance(config, cls):
+        raise ConfigError(f"config: found a {type(config).__name__}, expected a {cls.__name__}, or None")
+    return config
 
 
 def settings_fields(cls: Any) -> tuple[tuple[dataclasses.Field[Any], Any], ...]:

@@ -7,6 +7,7 @@ from functools import lru_cache, partial
 from typing import Protocol, runtime_checkable
 
 from sst_graph.types import CameraImage, Frame, Scan, Source
+from sst_graph.validation import checked_frame, checked_image, checked_scan
 
 
 @runtime_checkable
@@ -29,17 +30,51 @@ class SeparateReader(Protocol):
 
 def number_at(source: Source, position: int) -> int:
     """Index of the frame at a position."""
-    return source.frame_number(position) if isinstance(source, SeparateReader) else source[position].index
+    if isinstance(source, SeparateReader):
+        return source.frame_number(position)
+    return _frame_at(source, position).index
 
 
 def scan_at(source: Source, position: int) -> Scan | None:
     """Scan of the frame at a position."""
-    return source.read_scan(position) if isinstance(source, SeparateReader) else source[position].scan
+    if isinstance(source, SeparateReader):
+        return source.read_scan(position)
+    return _frame_at(source, position).scan
 
 
 def image_at(source: Source, position: int) -> CameraImage | None:
     """Image of the frame at a position."""
-    return source.read_image(position) if isinstance(source, SeparateReader) else source[position].image
+    if isinstance(source, SeparateReader):
+        return source.read_image(position)
+    return _frame_at(source, position).image
+
+
+def checked_scan_at(source: Source, position: int) -> Scan | None:
+    """Scan of the frame at a position, before the drive is prepared.
+
+    Raises:
+        DataError: one that cannot be used, of a source that checks nothing itself.
+    """
+    scan = scan_at(source, position)
+    return None if scan is None else checked_scan(scan, _place(source, position), fewest=0)
+
+
+def checked_image_at(source: Source, position: int) -> CameraImage | None:
+    """Image of the frame at a position, before the drive is prepared.
+
+    Raises:
+        DataError: as :func:`checked_scan_at`.
+    """
+    image = image_at(source, position)
+    return None if image is None else checked_image(image, source.camera, _place(source, position))
+
+
+def _frame_at(source: Source, position: int) -> Frame:
+    return checked_frame(source[position], _place(source, position))
+
+
+def _place(source: Source, position: int) -> str:
+    return f"{source.name}, frame at position {position}"
 
 
 def scan_positions(source: Source) -> Sequence[int]:
@@ -75,12 +110,13 @@ class AheadReader:
         if isinstance(source, SeparateReader):
             if position not in self._scans:
                 _make_room(self._scans, _SCANS)
-                self._scans[position] = source.read_scan(position)
+                self._scans[position] = checked_scan_at(source, position)
             return self._scans[position]
         if position not in self._frames:
             _make_room(self._frames, _FRAMES)
-            self._frames[position] = source[position]
-        return self._frames[position].scan
+            self._frames[position] = _frame_at(source, position)
+        scan = self._frames[position].scan
+        return None if scan is None else checked_scan(scan, _place(source, position), fewest=0)
 
     def frame(self, position: int) -> Frame:
         """Frame at a position; IndexError as the source's own."""
@@ -88,7 +124,7 @@ class AheadReader:
             return self._frames.pop(position)
         source = self.source
         if not isinstance(source, SeparateReader):
-            return source[position]
+            return checked_frame(source[position], _place(source, position))
         seen = position in self._scans
         scan = self._scans.pop(position) if seen else source.read_scan(position)
         return Frame(source.frame_number(position), scan, source.read_image(position))

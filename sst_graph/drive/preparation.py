@@ -28,7 +28,7 @@ from sst_graph.odometry.relative import relative_pose
 from sst_graph.odometry.sweep import SweepDecision, SweptSource
 from sst_graph.odometry.visual import ImagePair
 from sst_graph.types import CameraImage, Frame, RelativeMotion, Scan, SemanticClass, Source
-from sst_graph.validation import checked_image, checked_scan
+from sst_graph.validation import checked_frame, checked_image, checked_scan
 
 _LOG = logging.getLogger(__name__)
 
@@ -318,7 +318,7 @@ def prepare_drive(
     total = len(source)
     left_out, collector, store = LeftOut(), StatisticsCollector(total), ArrayStore(config.in_memory_bytes)
     for position, frame in enumerate(source):
-        frame = _checked(frame, source.camera, f"{source.name}, frame {frame.index}")
+        frame = _checked(frame, source.camera, source.name, position)
         left_out.add(frame)
         collector.add(frame)
         if frame.scan is not None:
@@ -356,8 +356,10 @@ def prepare_drive(
     )
 
 
-def _checked(frame: Frame, camera: PinholeCamera, place: str) -> Frame:
+def _checked(frame: object, camera: PinholeCamera, drive: str, position: int) -> Frame:
     """The frame with checked arrays; odometry bridges a scan without points."""
+    frame = checked_frame(frame, f"{drive}, frame at position {position}")
+    place = f"{drive}, frame {frame.index}"
     scan = None if frame.scan is None else checked_scan(frame.scan, place, fewest=0)
     image = None if frame.image is None else checked_image(frame.image, camera, place)
     return Frame(frame.index, scan, image)

@@ -64,7 +64,11 @@ def read_file(path: str | Path, kind: FileKind) -> bytes:
         DataError: missing, unreadable, no regular file, or larger. Nothing blocks: a FIFO is not waited for.
     """
     with _opened(path, kind) as stream:
-        data = stream.read(kind.max_bytes + 1)
+        # read(n) reserves n bytes before it reads: no more than the file has.
+        size = min(os.fstat(stream.fileno()).st_size, kind.max_bytes)
+        data = stream.read(size + 1)
+        if len(data) > size:  # it grew meanwhile, or says nothing of its size, as in /proc
+            data += stream.read(kind.max_bytes + 1 - len(data))
     if len(data) > kind.max_bytes:
         raise _too_large(path, len(data), kind)
     return data

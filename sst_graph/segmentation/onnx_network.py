@@ -50,12 +50,7 @@ class OnnxNetwork:
         options.log_severity_level = 4  # what it has to say comes as an exception, too
         threads = os.environ.get("OMP_NUM_THREADS", "")
         options.intra_op_num_threads = int(threads) if threads.isdecimal() else 0
-        try:
-            self._session = runtime.InferenceSession(
-                str(path), options, providers=runtime.get_available_providers()
-            )
-        except Exception as error:  # its exceptions share no other base
-            raise DataError(path, f"no network that loads ({_line(error)})", NETWORK.name) from None
+        self._session = _session(runtime, path, options)
         inputs = self._session.get_inputs()
         if len(inputs) != 1:
             named = ", ".join(one.name for one in inputs)
@@ -129,6 +124,24 @@ class OnnxNetwork:
         if wanted not in outputs:
             raise DataError(self.path, f"outputs {', '.join(self.outputs)}", f"one called {wanted}")
         return outputs[wanted]
+
+
+def _session(runtime: Any, path: Path, options: Any) -> Any:
+    """The network on the first providers that take it, all or the processor alone.
+
+    Raises:
+        DataError: on neither.
+    """
+    every = runtime.get_available_providers()
+    refusal: Exception | None = None
+    for providers in (every, ["CPUExecutionProvider"]):
+        try:
+            # Its own fallback tells of it on stdout.
+            return runtime.InferenceSession(str(path), options, providers=providers, enable_fallback=0)
+        except Exception as error:  # its exceptions share no other base
+            refusal = refusal or error
+    assert refusal is not None
+    raise DataError(path, f"no network that loads ({_line(refusal)})", NETWORK.name) from None
 
 
 def _runtime(path: Path) -> Any:

@@ -9,6 +9,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
+from sst_graph.config import expect_settings
 from sst_graph.drive.stamp_intervals import Jump
 from sst_graph.errors import DataError, EstimationError
 from sst_graph.factors.camera import PinholeCamera
@@ -36,7 +37,7 @@ from sst_graph.tracker.storage.snapshot import Snapshot
 from sst_graph.tracker.track_update import Sensor, TrackUpdate
 from sst_graph.tracker.window.matcher import WindowMatcher
 from sst_graph.types import CameraImage, Frame, Scan
-from sst_graph.validation import LATEST_NS
+from sst_graph.validation import LATEST_NS, checked_frame, checked_guess, checked_intrinsics
 
 _LOG = logging.getLogger(__name__)
 
@@ -73,8 +74,15 @@ class Tracker:
             initial_time_offset_s: rough guess of the time offset [s].
             sweep: what was decided of the sweep of the scans (``SweptSource.sweep_decision``). Undecided, its
                 effect is in the covariance, and where it matters no estimate is ``ok``.
+
+        Raises:
+            DataError: no camera, or no guess of two sensors on one vehicle.
+            ConfigError: no settings of a tracker.
         """
-        self.setup = Setup(camera, config or TrackerConfig(), initial, initial_time_offset_s)
+        camera = checked_intrinsics(camera)
+        initial, initial_time_offset_s = checked_guess(initial, initial_time_offset_s)
+        settings = expect_settings(config, TrackerConfig)
+        self.setup = Setup(camera, settings, initial, initial_time_offset_s)
         config = self.setup.config.estimating
         guess = Guess(initial, initial_time_offset_s, search=config.calibration.search.enabled)
         self.inputs = SensorInputs(camera, config, searched_scans(config))
@@ -87,7 +95,11 @@ class Tracker:
 
     def add(self, frame: Frame) -> TrackUpdate:
         """Add a frame's image and scan; either may be missing, and either may be refused alone."""
-        if not isinstance(frame, Frame) or (frame.image is None and frame.scan is None):
+        try:
+            frame = checked_frame(frame)
+        except DataError as error:
+            return make_update(self, 0, str(error))
+        if frame.image is None and frame.scan is None:
             return make_update(self, 0, "a frame without scan and without image")
         self.last_update = dataclasses.replace(self._add_sensors(frame), frame=frame.index)
         return self.last_update
@@ -315,6 +327,6 @@ class Tracker:
                 self.inputs.restart()
                 self._restart(Restart(Guess(point.cTl, point.time_offset_s, guess.search), 0, why), 0)
                 why = f"{why}; the calibration is estimated again"
-        stamp_ns = getattr(data, "stamp_ns", 0)
+        stamp_ns = data.stamp_ns if isinstance(data, Scan | CameraImage) else 0
         known = isinstance(stamp_ns, int | np.integer) and abs(int(stamp_ns)) <= LATEST_NS
         return dataclasses.replace(make_update(self, int(stamp_ns) if known else 0, why), refused=(sensor,))

@@ -50,7 +50,14 @@ def picture_of(message: Any, type_name: str, place: str) -> NDArray[np.uint8]:
         return decoded_picture(bytes(message.data), place)
     rows = _rows(message, place)
     code = _TO_BGR.get(message.encoding)
-    return np.ascontiguousarray(rows) if code is None else np.asarray(cv2.cvtColor(rows, code), np.uint8)
+    if code is None:
+        return np.ascontiguousarray(rows)
+    try:
+        return np.asarray(cv2.cvtColor(rows, code), np.uint8)
+    except cv2.error:
+        # Such as an odd width, where two pixels share their colour.
+        found = f"{message.width}x{message.height} px"
+        raise DataError(place, found, f"a size that encoding {message.encoding} can have") from None
 
 
 def mask_of(message: Any, type_name: str, place: str) -> NDArray[np.uint8]:
