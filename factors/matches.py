@@ -187,4 +187,6 @@ def joined_points(alignments: Sequence[Alignment]) -> Sequence[Alignment]:
     if len(alignments) == 1 or not alike:
         return alignments
     names = ("lPs", "base_taus_s", "pixels", "sigmas_px", "weights")
-    return [replace(first, **{name: np.concatenate([getattr(a, name) for a in alignments]) for name in names})]
+    return [
+        replace(first, **{name: np.concatenate([getattr(a, name) for a in alignments]) for name in names})
+    ]
