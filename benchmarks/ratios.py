@@ -6,7 +6,9 @@ Linearization: a frame's factor (5,000 points, 1,500 pixels) and the normal equa
 Matching: nearest pixels and points of a frame, contours of a whole drive. Beside them: one factor a match;
 what scipy needs (``least_squares`` with one evaluation of residuals and Jacobian written in plain NumPy,
 robust weights included; for matching KD-trees); a fused loop compiled by numba (extra ``bench``). All give
-the same result, which is checked first. The ways take turns, and the least time of many calls counts.
+the same result, which is checked first. That of the compiled loop is what the package hands on, too: gtsam's
+linear factor, normal equations, checked matches; what of its time the loop itself takes has a column of its
+own. The ways take turns, and the least time of many calls counts.
 """
 
 from __future__ import annotations

@@ -142,7 +142,7 @@ class Alignment:
     @cached_property
     def centred(self) -> FloatArray:
         """(2, n) pixels from the principal point [px]."""
-        return self.columns[1] - np.array([[self.camera.cx], [self.camera.cy]])
+        return np.asarray(self.columns[1] - np.array([[self.camera.cx], [self.camera.cy]]))
 
     @cached_property
     def slopes(self) -> FloatArray:
@@ -186,5 +186,13 @@ def joined_points(alignments: Sequence[Alignment]) -> Sequence[Alignment]:
     )
     if len(alignments) == 1 or not alike:
         return alignments
-    names = ("lPs", "base_taus_s", "pixels", "sigmas_px", "weights")
-    return [replace(first, **{name: np.concatenate([getattr(a, name) for a in alignments]) for name in names})]
+    return [
+        replace(
+            first,
+            lPs=np.concatenate([each.lPs for each in alignments]),
+            base_taus_s=np.concatenate([each.base_taus_s for each in alignments]),
+            pixels=np.concatenate([each.pixels for each in alignments]),
+            sigmas_px=np.concatenate([each.sigmas_px for each in alignments]),
+            weights=np.concatenate([each.weights for each in alignments]),
+        )
+    ]

@@ -16,7 +16,8 @@ Points are columns here: (3, n); a Jacobian over k residual rows of n points is 
 Where all points share one tau, the scan moves as one rigid body, cP_i = cTl' . lP_i, and every
 derivative factors through the six numbers L_i = [cP_i x g_i; g_i] of a residual's gradient g_i by cP_i
 (a wrench): J_i = lift . L_i with one (13, 6) matrix for all points. :class:`RigidlyMoved` keeps that
-form, which halves the work; :class:`PointwiseMoved` is the general case.
+form, which halves the work, :class:`GroupsMoved` keeps it for the points of many images, each with its lift;
+:class:`PointwiseMoved` is the general case.
 """
 
 from __future__ import annotations

@@ -251,7 +251,7 @@ def _gradients(slopes: FloatArray, xy: FloatArray, inverse_z: FloatArray) -> Flo
 def _squares(alignment: Alignment, evaluated: Evaluated) -> FloatArray:
     """(n,) square of each match's whitened residual."""
     squares = np.square(evaluated.rows[-1] / alignment.sigmas_px)
-    return squares[0] if len(squares) == 1 else np.add(squares[0], squares[1])
+    return np.asarray(squares[0] if len(squares) == 1 else squares[0] + squares[1])
 
 
 def _behind_costs(alignment: Alignment, behind: NDArray[np.bool_]) -> float:

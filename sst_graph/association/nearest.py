@@ -46,10 +46,10 @@ class NearestPixels:
         uvs must lie on the image (see :meth:`sst_graph.factors.PinholeCamera.in_image`).
         """
         h, w = self.index.shape
-        columns = np.clip((uvs[:, 0] + 0.5).astype(np.intp), 0, w - 1)
-        rows = np.clip((uvs[:, 1] + 0.5).astype(np.intp), 0, h - 1)
-        nearest_rows, nearest_columns = np.divmod(self.index[rows, columns], np.int32(w))
-        return np.stack([nearest_columns, nearest_rows], axis=1).astype(np.float64)
+        columns, rows = np.minimum((uvs.T + 0.5).astype(np.intp), [[w - 1], [h - 1]])
+        nearest = self.index.take(rows * w + columns)
+        nearest_rows = nearest // np.int32(w)
+        return np.stack([nearest - nearest_rows * np.int32(w), nearest_rows], axis=1).astype(np.float64)
 
 
 def nearest_points(uvs: FloatArray, pixels: FloatArray) -> NDArray[np.intp]:

@@ -136,7 +136,7 @@ class _Images:
         """For each time offset its images (f,), the columns of the extrinsic and of it, and where these stand
         in H_mixed."""
         parts = [(self.clocks == c, np.array([*range(6), c])) for c in np.unique(self.clocks).tolist()]
-        return [(own, columns, np.ix_(own, range(6), columns)) for own, columns in parts]
+        return [(own, columns, np.ix_(own, np.arange(6), columns)) for own, columns in parts]
 
 
 @dataclass(frozen=True)
@@ -206,7 +206,7 @@ class _Frames:
     @cached_property
     def into_mixed(self) -> tuple[IntArray, ...]:
         """Where the products of twists and ``columns`` stand in H_mixed."""
-        return np.ix_(self.places, range(6), self.columns)
+        return np.ix_(self.places, np.arange(6), self.columns)
 
 
 class FrozenProblem:

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from sst_graph.factors import CameraTwist, move_points
-from sst_graph.factors.motion import exponential_coefficients, se3_left_jacobian
+from sst_graph.factors.motion import (
+    exponential_coefficients,
+    group_poses,
+    move_groups,
+    se3_left_jacobian,
+    transformed,
+)
 
 STILL = np.zeros(6)
 
@@ -132,3 +138,23 @@ def test_derivatives_at_100_points(model, rigid, speed, objects):
         numerical = (4.0 * fine - coarse) / 3.0
         scale = max(np.abs(numerical).max(), 1e-3)
         np.testing.assert_allclose(J[column] / scale, numerical / scale, atol=1e-6)
+
+
+def test_groups_move_as_their_points_do_each_with_its_own_tau_and_image():
+    rng = np.random.default_rng(13)
+    bounds, cTl = np.array([0, 4, 4, 9]), gtsam.Pose3.Expmap(rng.normal(size=6))  # the second has none
+    counts, taus_s = np.diff(bounds), np.array([0.13, -0.2, 0.05])
+    twists, accelerations = rng.normal(size=(2, 3, 6))
+    lPs, g = rng.normal(0.0, 10.0, (3, 9)), rng.normal(size=(3, 2, 9))
+    groups = CameraTwist(twists, accelerations)
+    each = CameraTwist(*(np.repeat(rows, counts, axis=0).T for rows in (twists, accelerations)))
+    single = move_points(cTl, lPs, np.repeat(taus_s, counts), each)
+    moved = move_groups(cTl, lPs, bounds, taus_s, groups)
+    np.testing.assert_allclose(moved.cPs, single.cPs, rtol=1e-12, atol=1e-12)
+    by_pose = transformed(group_poses(cTl, taus_s, groups), lPs, bounds)
+    np.testing.assert_allclose(by_pose, single.cPs, rtol=1e-12, atol=1e-12)
+    expected, wrenches = np.empty((13, 2, 9)), np.empty((6, 2, 9))
+    single.write_rows(g, expected)
+    moved.write_rows(g, wrenches)
+    lifts = np.repeat(moved.lift, counts, axis=0)
+    np.testing.assert_allclose(np.einsum("nij,jkn->ikn", lifts, wrenches), expected, rtol=1e-10, atol=1e-10)
