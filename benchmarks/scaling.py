@@ -37,12 +37,14 @@ from numpy.typing import NDArray
 
 from sst_graph import CalibrationConfig, open_source
 from sst_graph.batch.calibrate import calibrate_prepared, prepare_drives
+from sst_graph.batch.method_estimate import Guess
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.drive.preparation import Drive
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.graph.outer_loop import solve_joint
 from sst_graph.graph.state import State
-from sst_graph.rig.calibrate import Guess, KnownRig, calibrate_rig_prepared, prepare_rig
+from sst_graph.rig.calibrate import calibrate_rig_prepared, prepare_rig
+from sst_graph.rig.known import KnownRig
 from sst_graph.simulator import SimulationConfig, simulate, write_drive
 from sst_graph.types import CameraImage, Frame, GroundTruth, Scan, SemanticClass
 
@@ -118,7 +120,8 @@ class ForthAndBack:
 
     @property
     def nominal(self) -> gtsam.Pose3 | None:
-        return self.source.nominal
+        nominal: gtsam.Pose3 | None = self.source.nominal
+        return nominal
 
     @property
     def truth(self) -> GroundTruth | None:
@@ -144,10 +147,12 @@ class ForthAndBack:
         return position
 
     def read_scan(self, position: int) -> Scan:
-        return replace(self.source.read_scan(self._played(position)), stamp_ns=position * PERIOD_NS)
+        scan: Scan = self.source.read_scan(self._played(position))
+        return replace(scan, stamp_ns=position * PERIOD_NS)
 
     def read_image(self, position: int) -> CameraImage:
-        return replace(self.source.read_image(self._played(position)), stamp_ns=position * PERIOD_NS)
+        image: CameraImage = self.source.read_image(self._played(position))
+        return replace(image, stamp_ns=position * PERIOD_NS)
 
     def _played(self, position: int) -> int:
         last = len(self.source) - 1
@@ -186,9 +191,11 @@ def calibrated(drive: Path, frames: int, cameras: int, whole: bool) -> dict[str,
 
 def solve_twelve(drives: Sequence[Drive], truth: GroundTruth, config: CalibrationConfig) -> None:
     """Outer iterations from the truth, the same number whatever they find."""
-    problem = CalibrationProblem.of(drives, Guess(truth.cTl, truth.time_offset_s), config)
+    time_offset_s = truth.time_offset_s
+    assert time_offset_s is not None
+    problem = CalibrationProblem.of(drives, Guess(truth.cTl, time_offset_s), config)
     joint = replace(problem.joint(), config=replace(problem.config.joint, max_outer=ITERATIONS))
-    found = solve_joint(joint, State(truth.cTl, (truth.time_offset_s,)), step_sigmas=0.0)
+    found = solve_joint(joint, State(truth.cTl, (time_offset_s,)), step_sigmas=0.0)
     assert found.outer_iterations == ITERATIONS
 
 

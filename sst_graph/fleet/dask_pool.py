@@ -8,6 +8,7 @@ so that lost workers say nothing of it.
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
@@ -106,6 +107,8 @@ def _record(future: Any, job: Job, error: BaseException | None, is_lost: bool) -
 def _client(distributed: Any, cluster: Cluster) -> Any:
     try:
         if cluster.address == LOCAL:
+            # Its scheduler and nannies run in this process: what they do every minute is no news here.
+            logging.getLogger("distributed").setLevel(logging.WARNING)
             local = distributed.LocalCluster(
                 n_workers=cluster.workers, threads_per_worker=1, processes=True, dashboard_address=None
             )

@@ -175,7 +175,7 @@ def test_from_s3_to_s3(drives: Path, tmp_path: Path, s3: str, monkeypatch: pytes
 
 
 @pytest.mark.slow
-def test_on_dask(drives: Path, tmp_path: Path) -> None:
+def test_on_dask(drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("distributed")
     out = tmp_path / "out"
     one = str(drives / "v?_*-08")
@@ -184,6 +184,7 @@ def test_on_dask(drives: Path, tmp_path: Path) -> None:
         "v1_2026-03-08": "unobservable",
         "v2_2026-03-08": "bad_input",
     }
+    assert "INFO" not in capfd.readouterr().err  # Dask's own business
 
 
 @pytest.mark.parametrize(

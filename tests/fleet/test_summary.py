@@ -130,6 +130,18 @@ def test_the_page_shows_failures_and_runs_nothing_of_the_data(
     assert page.index(">d0</a>") < page.index('row">c0<') < page.index(">b0</a>") < page.index(">a0</a>")
 
 
+def test_reasons_that_drives_share_are_counted_together(tmp_path: Path) -> None:
+    drives = [drive(f"x{k}") for k in range(4)]
+    records = {one.name: done(one.name, result(k, "not_converged")) for k, one in enumerate(drives)}
+    for k, name in enumerate(("x0", "x1", "x2")):
+        words = f"{name}/00: the scans move by {0.5 * k} cm: say how (2 more in its report)"
+        records[name] = replace(records[name], reason=words)
+    write_summary(drives, records, Place.of(tmp_path), BatchConfig())
+    page = (tmp_path / "summary.html").read_text()
+    assert "<li>3 × not_converged: the scans move by … cm: say how</li>" in page
+    assert "0 of 4 drives are ok; 0 have no result" in page
+
+
 def test_all_fine(tmp_path: Path) -> None:
     drives = [drive("x", "v"), drive("y", "v")]
     records = {name: done(name, result(k)) for k, name in enumerate("xy")}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Sequence
 from importlib.resources import files
@@ -67,20 +68,28 @@ def _verdict(rows: Sequence[Row], vehicle_rows: Sequence[Row]) -> str:
     )
     failed = [row for row in rows if not row["report"]]
     state = "ok" if counts["ok"] == len(rows) else "not_converged" if failed else "unobservable"
-    reasons = Counter(_kind_of(row) for row in failed)
+    reasons = Counter(_kind_of(row) for row in rows if row["status"] != "ok")
     wrong = [row for row in vehicle_rows if row["status"] != "ok"]
     return section(
         "verdict",
         "Verdict",
-        f'<p class="verdict {state}">{counts["ok"]} of {len(rows)} drives are ok; '
-        f"{len(failed)} have no result"
-        + (f"; {len(wrong)} of {len(vehicle_rows)} vehicles need attention" if vehicle_rows else "")
+        f'<p class="verdict {state}">{counts["ok"]} of {len(rows)} drives {_verb(counts["ok"], "is", "are")} '
+        f"ok; {len(failed)} {_verb(len(failed), 'has', 'have')} no result"
+        + (
+            f"; {len(wrong)} of {len(vehicle_rows)} vehicles {_verb(len(wrong), 'needs', 'need')} attention"
+            if vehicle_rows
+            else ""
+        )
         + "</p>",
         f'<div class="bars">{bars}</div>',
         paragraph(counts_line(rows)),
         paragraph(_cost_line(rows), "note"),
         bullets(f"{count} × {kind}" for kind, count in reasons.most_common(12)),
     )
+
+
+def _verb(count: int, one: str, many: str) -> str:
+    return one if count == 1 else many
 
 
 def _cost_line(rows: Sequence[Row]) -> str:
@@ -97,11 +106,18 @@ def _cost_line(rows: Sequence[Row]) -> str:
 
 
 def _kind_of(row: Row) -> str:
-    """A failure's status and the part of its reason that drives have in common."""
-    reason = str(row["reason"])
+    """A status and the part of its reason that drives have in common: no numbers, no name of the drive."""
+    reason = _MORE.sub("", str(row["reason"]))
+    if row["report"]:
+        reason = re.sub(rf"^{re.escape(str(row['drive']))}[^ ]*: ", "", reason)
+        return f"{row['status']}: {_NUMBER.sub('…', reason)}"[:_LONGEST_KIND]
     words = reason.split(": found ", 1)
     last = words[0].rsplit("/", 1)[-1] if len(words) == 2 else ""
-    return f"{row['status']}: {last}: found {words[1]}"[:160] if last else f"{row['status']}: {reason}"[:160]
+    return f"{row['status']}: {f'{last}: found {words[1]}' if last else reason}"[:_LONGEST_KIND]
+
+
+_LONGEST_KIND = 160
+_MORE, _NUMBER = re.compile(r" \(\d+ more in its report\)$"), re.compile(r"\d+(?:\.\d+)?")
 
 
 def _vehicles(rows: Sequence[Row]) -> str:
