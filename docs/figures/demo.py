@@ -21,20 +21,33 @@ from sst_graph import SemanticClass, open_source
 FRAME = 12
 WIDTH, QUALITY = 1000, 82
 VERDICT_PX = (860, 560)
-"""Size of the window that shows the head of the report."""
+CLOSE_UPS_PX = (1400, 960)
+"""Sizes of the windows that show the head of the report, and two rows of its close-ups."""
 
 Picture = NDArray[np.uint8]
 
 
 def take(folder: Path, into: Path) -> None:
-    """Write demo_inputs.jpg, demo_overlay.jpg and demo_report.png."""
+    """Write demo_inputs.jpg, demo_overlay.jpg, demo_report.png and demo_close_ups.jpg."""
     _save(into / "demo_inputs.jpg", _inputs(folder / "drive"))
     overlay = folder / "calibration" / f"overlay_drive_00_{FRAME:06d}.png"
     picture = cv2.imread(str(overlay))
     if picture is None:
         raise SystemExit(f"{overlay}: found no picture, expected one of make demo")
     _save(into / "demo_overlay.jpg", np.asarray(picture, np.uint8))
-    _photograph(folder / "calibration" / "report.html", into / "demo_report.png")
+    report = folder / "calibration" / "report.html"
+    _photograph(report, into / "demo_report.png", VERDICT_PX)
+    take_close_ups(report, into / "demo_close_ups.jpg")
+
+
+def take_close_ups(report: Path, path: Path) -> None:
+    """The first six close-ups of a report."""
+    with tempfile.TemporaryDirectory() as folder:
+        page, picture = Path(folder) / "page.html", Path(folder) / "page.png"
+        hidden = "<style>h1, section:not(#objects), #objects > :not(.grid) { display: none }</style>"
+        page.write_text(report.read_text(encoding="utf-8") + hidden, encoding="utf-8")
+        _photograph(page, picture, CLOSE_UPS_PX)
+        _save(path, np.asarray(cv2.imread(str(picture)), np.uint8))
 
 
 def _inputs(folder: Path) -> Picture:
@@ -76,8 +89,8 @@ def _save(path: Path, picture: Picture) -> None:
     print(path)
 
 
-def _photograph(page: Path, path: Path) -> None:
-    """The head of a page, as a browser shows it."""
+def _photograph(page: Path, path: Path, size: tuple[int, int]) -> None:
+    """The head of a page, as a browser shows it in a window of width and height [px]."""
     browser = shutil.which("chromium") or shutil.which("google-chrome")
     if browser is None:
         raise SystemExit(
@@ -87,7 +100,7 @@ def _photograph(page: Path, path: Path) -> None:
         subprocess.run(
             [
                 browser, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars",
-                f"--user-data-dir={profile}", "--window-size={},{}".format(*VERDICT_PX),
+                f"--user-data-dir={profile}", "--window-size={},{}".format(*size),
                 f"--screenshot={path}", page.resolve().as_uri(),
             ],
             check=True, capture_output=True,
