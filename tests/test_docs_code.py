@@ -177,7 +177,7 @@ def test_the_glossary_has_forty_terms_at_most() -> None:
 
 
 def test_every_test_that_a_page_names_is_there() -> None:
-    """A row of a fault matrix is worth what its test is: ``tests/a.py::test_b``, or ``::test_c`` of the same."""
+    """A row of a fault matrix is worth what its test is: ``tests/a.py::test_b``, ``::test_c`` of the same."""
     named, missing = 0, []
     for page in sorted(DOCS.rglob("*.md")):
         path = ""

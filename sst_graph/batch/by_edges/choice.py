@@ -10,12 +10,7 @@ import numpy as np
 
 from sst_graph.batch.by_edges.label_parts import labelled_stamps
 from sst_graph.batch.config import CalibrationConfig, Method
-from sst_graph.data.frame_parts import (
-    checked_image_at,
-    checked_scan_at,
-    image_positions,
-    scan_positions,
-)
+from sst_graph.data.frame_parts import image_at, image_positions, scan_at, scan_positions
 from sst_graph.drive.preparation import Drive
 from sst_graph.types import SemanticClass, Source
 
@@ -64,14 +59,8 @@ class _Looks:
 
     @classmethod
     def at(cls, source: Source) -> _Looks:
-        images = [
-            image
-            for k in _some(image_positions(source))
-            if (image := checked_image_at(source, k)) is not None
-        ]
-        scans = [
-            scan for k in _some(scan_positions(source)) if (scan := checked_scan_at(source, k)) is not None
-        ]
+        images = [image for k in _some(image_positions(source)) if (image := image_at(source, k)) is not None]
+        scans = [scan for k in _some(scan_positions(source)) if (scan := scan_at(source, k)) is not None]
         return cls(
             tuple(_classes(scan.classes) for scan in scans),
             tuple(_classes(image.mask) for image in images),
