@@ -9,6 +9,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from checks.fault_matrix import (
@@ -204,9 +206,9 @@ def test_same_input_same_bytes_with_one_thread_and_two(bench: Bench) -> None:
 
 def test_too_little_memory_is_one_line(tmp_path: Path) -> None:
     drive = tmp_path / "sequences" / "00"
-    (drive / "velodyne").mkdir(parents=True)
-    for name in ("labels", "image_2", "semantic_2"):
-        (drive / name).mkdir()
+    for name in ("velodyne", "image_2"):
+        (drive / name).mkdir(parents=True)
+    cv2.imwrite(str(drive / "image_2/000000.png"), np.zeros((6, 8, 3), np.uint8))
     (drive / "calib.txt").write_text("P2: 700 0 4 0 0 700 3 0 0 0 1 0\nTr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n")
     (drive / "times.txt").write_text("0\n")
     (drive / "velodyne/000000.bin").write_bytes(bytes(64_000_000))
