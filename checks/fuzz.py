@@ -36,7 +36,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from checks import fuzz_layouts
+from checks import fuzz_layouts, fuzz_results
 from checks import fuzz_mutations as m
 from sst_graph import CalibrationConfig, Tracker, TrackerConfig, calibrate, open_source
 from sst_graph.cli import main as command
@@ -148,6 +148,8 @@ def prepare(folder: Path, started: bool = False) -> None:
         # Formats with named frames, with the camera's link and its optical frame below it.
         options = ExportOptions(child="camera_link") if target in ROBOTS else ExportOptions()
         (folder / "exports" / target).write_text(export_text(result, target, options))
+    results = folder / "results"
+    fuzz_results.write_results(folder / "tiny" / "sequences" / "00", folder / "calibration.json", results)
     truth = street.truth
     document = {"T_camera_lidar": truth.cTl.matrix().tolist(), "time_offset_s": 0.0, "camera": "image_2"}
     (folder / "truth.json").write_text(json.dumps(document))
@@ -396,6 +398,18 @@ def _other_layout(kind: str) -> Callable[[Ground, Rng], None]:
     return attempt
 
 
+def _of_results(kind: str) -> Callable[[Ground, Rng], None]:
+    """A mutated file of a network, of labels, of a rig or of a batch."""
+
+    def attempt(ground: Ground, rng: Rng) -> None:
+        folder = ground.folder / "results"
+        path, mutation = fuzz_results.target(folder, kind, rng)
+        with ground.mutated(rng, path, mutation):
+            fuzz_results.KINDS[kind][0](folder, ground.drive, path)
+
+    return attempt
+
+
 def _messages(ground: Ground, rng: Rng) -> None:
     fuzz_layouts.messages(ground.folder / "layouts", rng)
 
@@ -448,6 +462,7 @@ KINDS: Kinds = {
     "nuscenes": (_other_layout("nuscenes"), 0.8),
     "bags": (_other_layout("bags"), 0.8),
     "messages": (_messages, 0.8),
+    **{kind: (_of_results(kind), 0.5) for kind in fuzz_results.KINDS},
     "calibrate": (_calibrate, 0.0),
 }
 """What is tried, and how often; a weight of 0: only where it is asked for."""

@@ -153,6 +153,8 @@ def array_file(rng: Rng, data: bytes) -> bytes:
     """A .npy or .npz file: bytes, or other arrays in it."""
     if rng.random() < 0.5:
         return m.bytewise(rng, data)
+    if rng.random() < 0.2 and not data.startswith(b"PK"):
+        return npy_of(m.pick(rng, HEADERS))
     kind = m.pick(rng, ("<f8", "<i8", "|S3", "<c16", "|b1", "<M8[s]", ">f4", "<u8", "object"))
     shape = m.pick(rng, ((), (0,), (12,), (12, 3), (12, 4), (3, 12), (12, 0), (2, 2, 2), (12, 99)))
     values = np.full(shape, m.pick(rng, m.FLOATS))
@@ -167,6 +169,23 @@ def array_file(rng: Rng, data: bytes) -> bytes:
     else:
         np.save(stream, values)
     return stream.getvalue()
+
+
+def npy_of(header: str, count: int = 48) -> bytes:
+    """A .npy file of a header that NumPy would not write, and of zeros behind it."""
+    written = header.encode()
+    return b"\x93NUMPY\x01\x00" + len(written).to_bytes(2, "little") + written + bytes(count)
+
+
+HEADERS = (
+    "{'descr': ('<f4', (3,)), 'fortran_order': False, 'shape': (4,)}",
+    "{'descr': [('x', '<f4'), ('x', '<f4')], 'fortran_order': False, 'shape': (6,)}",
+    "{'descr': [('x', '<f4', (3,))], 'fortran_order': False, 'shape': (4,)}",
+    "{'descr': '<f4', 'fortran_order': False, 'shape': (-1, 3)}",
+    "{'descr': '<f4', 'fortran_order': 1, 'shape': (True, 12)}",
+    "{'descr': '<f4', 'fortran_order': False, 'shape': (12,) * 3}",
+    "__import__('os')",
+)
 
 
 def yaml_text(rng: Rng, data: bytes) -> bytes:
@@ -283,7 +302,7 @@ def messages(layouts: Path, rng: Rng) -> None:
             stamp_ns = 10**18 + frame.scan.stamp_ns
             table = table_of(frame.scan, np.full(len(frame.scan.points), 10, np.uint32))
             found.append((CLOUD, make.cloud(stamp_ns, table), stamp_ns))
-            found.append((IMAGE, make.image(stamp_ns, frame.image.pixels), stamp_ns))
+            found.append((IMAGE, _image(rng, make, stamp_ns, frame.image.pixels), stamp_ns))
             found.append((MASK, make.image(stamp_ns, np.zeros((6, 8), np.uint8), "mono8"), stamp_ns))
         for _ in range(int(rng.integers(1, 4))):
             k = int(rng.integers(len(found)))
@@ -294,6 +313,20 @@ def messages(layouts: Path, rng: Rng) -> None:
             with suppress(Exception):
                 bag.add(topic, message, received_ns)
     read_all(path, rng)
+
+
+def _image(rng: Rng, make: Any, stamp_ns: int, pixels: np.ndarray) -> Any:
+    """A picture; now and then in another encoding, or with fewer columns than its camera has."""
+    if rng.random() < 0.8:
+        return make.image(stamp_ns, pixels)
+    encoding, channels = m.pick(rng, ENCODINGS)
+    columns = pixels.shape[1] - int(rng.integers(3))
+    shape = (len(pixels), columns) if channels == 1 else (len(pixels), columns, channels)
+    return make.image(stamp_ns, np.full(shape, 90, np.uint8), encoding)
+
+
+ENCODINGS = (("yuv422", 2), ("yuv422_yuy2", 2), ("rgba8", 4), ("mono8", 1), ("bayer_gbrg8", 1))
+"""With their bytes a pixel."""
 
 
 def changed(rng: Rng, message: Any) -> Any:

@@ -174,3 +174,17 @@ def test_the_glossary_has_forty_terms_at_most() -> None:
     rows = re.findall(r"^\| (?!term|---)(.+)\|$", page, re.MULTILINE)
     assert 30 <= len(rows) <= 40
     assert all(row.rsplit("|", 1)[1].strip() for row in rows)  # each has its source
+
+
+def test_every_test_that_a_page_names_is_there() -> None:
+    """A row of a fault matrix is worth what its test is: ``tests/a.py::test_b``, ``::test_c`` of the same."""
+    named, missing = 0, []
+    for page in sorted(DOCS.rglob("*.md")):
+        path = ""
+        for file, name in re.findall(r"`(tests/[\w/]+\.py)?::(\w+)`", page.read_text(encoding="utf-8")):
+            path = file or path
+            source = DOCS.parent / path
+            named += 1
+            if not source.is_file() or f"def {name}(" not in source.read_text(encoding="utf-8"):
+                missing.append(f"{page.name}: {path}::{name}")
+    assert named > 15 and missing == []

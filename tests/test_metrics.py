@@ -129,7 +129,9 @@ def test_a_truth_with_an_error_of_its_own_counts_in_the_nees() -> None:
     assert errors.nees.time_offset == pytest.approx(0.004**2 / (0.002**2 + 0.001**2), rel=1e-6)
 
 
-@pytest.mark.parametrize("sigmas", [(-0.1, 0.0, 0.0), (0.0, np.nan, 0.0), (0.0, 0.0, np.inf)])
+@pytest.mark.parametrize(
+    "sigmas", [(-0.1, 0.0, 0.0), (0.0, np.nan, 0.0), (0.0, 0.0, np.inf), (1e308, 0.0, 0.0)]
+)
 def test_a_truth_sigma_out_of_range_is_refused(sigmas: tuple[float, float, float]) -> None:
     with pytest.raises(DataError, match="truth sigma"):
         TruthSigma(*sigmas)

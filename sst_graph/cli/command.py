@@ -8,12 +8,17 @@ import keyword
 import logging
 import os
 import sys
+import traceback
 from collections.abc import Sequence
 
 from sst_graph.cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_READER_GONE
 from sst_graph.cli.messages import StreamError, complain, flush, loudness
 from sst_graph.cli.options import build_parser
-from sst_graph.errors import SstGraphError
+from sst_graph.errors import SstGraphError, printable
+
+_LOG = logging.getLogger(__name__)
+_LONGEST = 390
+"""Characters of what was said elsewhere."""
 
 
 def run(argv: Sequence[str], own_process: bool = False) -> int:
@@ -39,6 +44,24 @@ def run(argv: Sequence[str], own_process: bool = False) -> int:
         return _failed(_sentence(error), EXIT_BAD_INPUT)
     except SstGraphError as error:
         return _failed(str(error), EXIT_BAD_INPUT)
+    except MemoryError as error:
+        needed = f" ({' '.join(str(error).split())})" if str(error) else ""
+        advice = "raise the limit of this process, or take fewer --frames"
+        return _failed(printable(f"not enough memory{needed}: {advice}", _LONGEST), EXIT_BAD_INPUT)
+    except Exception as error:
+        if not own_process:
+            raise
+        _LOG.debug("where it was", exc_info=error)
+        return _failed(_unexpected(error), EXIT_BAD_INPUT)
+
+
+def _unexpected(error: Exception) -> str:
+    """What nobody foresaw, on one line: a defect of this program, or of what it was extended by."""
+    steps = traceback.extract_tb(error.__traceback__)
+    where = f" at {os.path.basename(steps[-1].filename)}:{steps[-1].lineno}" if steps else ""
+    what = " ".join(f"{type(error).__name__}: {error}".split())
+    advice = "a defect, please report it with what --verbose says"
+    return f"unexpected {printable(what, _LONGEST)}{where} ({advice})"
 
 
 def _run(argv: Sequence[str], own_process: bool) -> int:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from functools import lru_cache, partial
 from typing import Protocol, runtime_checkable
 
-from sst_graph.types import CameraImage, Frame, Scan, Source
+from sst_graph.types import CameraImage, Frame, Scan, Source, intensities_of, with_intensities
 from sst_graph.validation import checked_frame, checked_image, checked_scan
 
 
@@ -32,45 +32,37 @@ def number_at(source: Source, position: int) -> int:
     """Index of the frame at a position."""
     if isinstance(source, SeparateReader):
         return source.frame_number(position)
-    return _frame_at(source, position).index
+    return frame_at(source, position).index
 
 
 def scan_at(source: Source, position: int) -> Scan | None:
     """Scan of the frame at a position."""
     if isinstance(source, SeparateReader):
         return source.read_scan(position)
-    return _frame_at(source, position).scan
+    return frame_at(source, position).scan
 
 
 def image_at(source: Source, position: int) -> CameraImage | None:
     """Image of the frame at a position."""
     if isinstance(source, SeparateReader):
         return source.read_image(position)
-    return _frame_at(source, position).image
+    return frame_at(source, position).image
 
 
-def checked_scan_at(source: Source, position: int) -> Scan | None:
-    """Scan of the frame at a position, before the drive is prepared.
-
-    Raises:
-        DataError: one that cannot be used, of a source that checks nothing itself.
-    """
-    scan = scan_at(source, position)
-    return None if scan is None else checked_scan(scan, _place(source, position), fewest=0)
-
-
-def checked_image_at(source: Source, position: int) -> CameraImage | None:
-    """Image of the frame at a position, before the drive is prepared.
+def frame_at(source: Source, position: int) -> Frame:
+    """Frame at a position; of a source that was made by hand, with checked parts.
 
     Raises:
-        DataError: as :func:`checked_scan_at`.
+        DataError: a part that cannot be used.
     """
-    image = image_at(source, position)
-    return None if image is None else checked_image(image, source.camera, _place(source, position))
-
-
-def _frame_at(source: Source, position: int) -> Frame:
-    return checked_frame(source[position], _place(source, position))
+    if isinstance(source, SeparateReader):
+        return source[position]
+    place = _place(source, position)
+    frame = checked_frame(source[position], place)
+    scan, image = frame.scan, frame.image
+    if scan is not None:
+        scan = with_intensities(checked_scan(scan, place, fewest=0), intensities_of(scan))
+    return Frame(frame.index, scan, None if image is None else checked_image(image, source.camera, place))
 
 
 def _place(source: Source, position: int) -> str:
@@ -110,13 +102,12 @@ class AheadReader:
         if isinstance(source, SeparateReader):
             if position not in self._scans:
                 _make_room(self._scans, _SCANS)
-                self._scans[position] = checked_scan_at(source, position)
+                self._scans[position] = source.read_scan(position)
             return self._scans[position]
         if position not in self._frames:
             _make_room(self._frames, _FRAMES)
-            self._frames[position] = _frame_at(source, position)
-        scan = self._frames[position].scan
-        return None if scan is None else checked_scan(scan, _place(source, position), fewest=0)
+            self._frames[position] = frame_at(source, position)
+        return self._frames[position].scan
 
     def frame(self, position: int) -> Frame:
         """Frame at a position; IndexError as the source's own."""
@@ -124,7 +115,7 @@ class AheadReader:
             return self._frames.pop(position)
         source = self.source
         if not isinstance(source, SeparateReader):
-            return checked_frame(source[position], _place(source, position))
+            return frame_at(source, position)
         seen = position in self._scans
         scan = self._scans.pop(position) if seen else source.read_scan(position)
         return Frame(source.frame_number(position), scan, source.read_image(position))

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sst_graph.data.frame_parts import image_at, scan_at
+from sst_graph.data.frame_parts import frame_at, image_at, scan_at
 from sst_graph.data.source_view import SourceView
 from sst_graph.features.compact_objects import find_compact_objects
 from sst_graph.features.ground import on_ground
@@ -26,7 +26,7 @@ class GeometricallyLabelled(SourceView):
 
     def __getitem__(self, position: int) -> Frame:
         """Frame at a position; IndexError as the source's own."""
-        frame = self.source[position]
+        frame = frame_at(self.source, position)
         return frame if frame.scan is None else replace(frame, scan=labelled_by_geometry(frame.scan))
 
     def __iter__(self) -> Iterator[Frame]:

@@ -51,18 +51,15 @@ class OnnxNetwork:
         threads = os.environ.get("OMP_NUM_THREADS", "")
         options.intra_op_num_threads = int(threads) if threads.isdecimal() else 0
         self._session = _session(runtime, path, options)
-        inputs = self._session.get_inputs()
+        inputs, self.outputs = _described(self._session, path)
         if len(inputs) != 1:
-            named = ", ".join(one.name for one in inputs)
+            named = ", ".join(name for name, _, _ in inputs)
             raise DataError(path, f"{len(inputs)} inputs ({named})", "one, the picture or the range image")
-        self._input = inputs[0].name
-        if inputs[0].type not in _DTYPES:
-            raise DataError(path, f"an input of {inputs[0].type}", f"one of {', '.join(_DTYPES)}")
-        self.dtype: Any = _DTYPES[inputs[0].type]
-        self.shape = tuple(
-            size if isinstance(size, int) and size > 0 else None for size in inputs[0].shape or ()
-        )
-        self.outputs = tuple(one.name for one in self._session.get_outputs())
+        self._input, kind, shape = inputs[0]
+        if kind not in _DTYPES:
+            raise DataError(path, f"an input of {kind}", f"one of {', '.join(_DTYPES)}")
+        self.dtype: Any = _DTYPES[kind]
+        self.shape = tuple(size if isinstance(size, int) and size > 0 else None for size in shape)
 
     def identity(self, version: int, numbers: LabelNumbers, use: tuple[object, ...]) -> str:
         """Digest of the network and of what is done with it: labels are stored under it.
@@ -142,6 +139,19 @@ def _session(runtime: Any, path: Path, options: Any) -> Any:
             refusal = refusal or error
     assert refusal is not None
     raise DataError(path, f"no network that loads ({_line(refusal)})", NETWORK.name) from None
+
+
+def _described(session: Any, path: Path) -> tuple[list[tuple[str, str, tuple[Any, ...]]], tuple[str, ...]]:
+    """Name, type and shape of each input, and the names of the outputs.
+
+    Raises:
+        DataError: names that are no text.
+    """
+    try:
+        inputs = [(one.name, one.type, tuple(one.shape or ())) for one in session.get_inputs()]
+        return inputs, tuple(one.name for one in session.get_outputs())
+    except UnicodeDecodeError as error:
+        raise DataError(path, f"names that are no UTF-8 ({_line(error)})", NETWORK.name) from None
 
 
 def _runtime(path: Path) -> Any:

@@ -9,6 +9,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from checks.fault_matrix import (
@@ -42,6 +44,30 @@ atexit.register(lambda: os.kill(os.getpid(), signal.SIGINT))
 from sst_graph.cli import main
 sys.exit(main())
 """
+
+
+LITTLE_MEMORY = """
+import resource, sys
+from sst_graph.cli import main
+import sst_graph.cli.command, sst_graph.cli.commands.info, sst_graph.data.kitti.odometry, cv2
+sys.argv = ["sst-graph", "info", sys.argv[1]]
+with open("/proc/self/statm", encoding="ascii") as stream:
+    present = int(stream.read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (present + (32 << 20), present + (32 << 20)))
+sys.exit(main())
+"""
+"""``info`` of a drive with 32 MB left."""
+FOREIGN_LOADER = """
+import sys
+from sst_graph.cli import main
+from sst_graph.data import Loader, register_loader
+def opened(path, options):
+    return {}[chr(27) + "[31m" + chr(10) + "x"]
+register_loader("foreign", Loader(lambda path: False, opened, "another layout"))
+sys.argv = ["sst-graph", "info", ".", "--loader", "foreign"]
+sys.exit(main())
+"""
+"""A reader of someone else's that fails in a way of its own."""
 
 
 @pytest.fixture(scope="module")
@@ -176,3 +202,32 @@ def test_same_input_same_bytes_with_one_thread_and_two(bench: Bench) -> None:
         ]
         digests.append([hashlib.sha256(output).hexdigest() for output in outputs])
     assert digests[0] == digests[1]
+
+
+def test_too_little_memory_is_one_line(tmp_path: Path) -> None:
+    drive = tmp_path / "sequences" / "00"
+    for name in ("velodyne", "image_2"):
+        (drive / name).mkdir(parents=True)
+    cv2.imwrite(str(drive / "image_2/000000.png"), np.zeros((6, 8, 3), np.uint8))
+    (drive / "calib.txt").write_text("P2: 700 0 4 0 0 700 3 0 0 0 1 0\nTr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n")
+    (drive / "times.txt").write_text("0\n")
+    (drive / "velodyne/000000.bin").write_bytes(bytes(64_000_000))
+    done = subprocess.run(
+        [sys.executable, "-c", LITTLE_MEMORY, str(tmp_path)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert done.stderr.startswith("sst-graph: error: not enough memory")
+
+
+def test_what_nobody_foresaw_is_one_line() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", FOREIGN_LOADER], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 2 and done.stdout == ""
+    line = done.stderr.removesuffix("\n")
+    assert line.isprintable() and line.startswith("sst-graph: error: unexpected KeyError: ")
+    assert "at <string>:6 (a defect, please report it with what --verbose says)" in line

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from checks.fuzz_layouts import HEADERS, npy_of
 from sst_graph.data.point_files import read_cloud
 from sst_graph.data.point_files.lzf import unpack_lzf
 from sst_graph.errors import DataError
@@ -198,6 +199,14 @@ def test_a_broken_file_is_one_line(tmp_path: Path, name: str) -> None:
         read_cloud(tmp_path / name).points()
     assert str(raised.value).isprintable() and name in str(raised.value)
     assert time.monotonic() - began < 1.0
+
+
+@pytest.mark.parametrize("header", HEADERS)
+def test_a_header_that_numpy_does_not_write(tmp_path: Path, header: str) -> None:
+    path = tmp_path / "a.npy"
+    path.write_bytes(npy_of(header))
+    with pytest.raises(DataError):
+        read_cloud(path).points()
 
 
 def test_a_zip_of_zeros_takes_no_memory(tmp_path: Path) -> None:

@@ -33,6 +33,17 @@ def test_a_regular_file_is_read_whole_and_through_a_link(tmp_path: Path) -> None
     assert read_file(tmp_path / "link", NOTE) == bytes(1000)
 
 
+def test_a_small_file_takes_little_memory_whatever_is_allowed(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"abc")
+    assert read_file(tmp_path / "a", FileKind("a note", 2**50)) == b"abc"
+
+
+def test_a_file_that_says_nothing_of_its_size_is_read_whole_or_refused() -> None:
+    assert b"MemTotal" in read_file("/proc/meminfo", FileKind("a note", 1_000_000))
+    with pytest.raises(DataError, match="a note"):
+        read_file("/proc/meminfo", FileKind("a note", 10))
+
+
 def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)  # the name of a socket may have 100 characters only
     os.mkfifo(tmp_path / "fifo")

@@ -295,3 +295,19 @@ def test_the_library_starts_without_the_extras(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(builtins, "__import__", watched)
     __import__("sst_graph.segmentation")
     assert found == []
+
+
+def test_a_damaged_network_says_nothing_of_its_own(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Every byte in turn to 0xff: onnxruntime's fallback to other providers prints on stdout."""
+    path = write_colour_network(tmp_path / "n.onnx")
+    valid = path.read_bytes()
+    refused = 0
+    for k in range(0, len(valid), 7):
+        path.write_bytes(valid[:k] + b"\xff" + valid[k + 1 :])
+        try:
+            open_image_segmenter(colour_yaml(path))
+        except SstGraphError as error:
+            refused += 1
+            assert str(error).isprintable()
+    assert refused > 5
+    assert capfd.readouterr() == ("", "")

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import gtsam
 import numpy as np
 import pytest
 from streets import saved_tracker
 
-from sst_graph import Tracker
-from sst_graph.errors import DataError
+from sst_graph import CalibrationConfig, PinholeCamera, Tracker
+from sst_graph.errors import DataError, SstGraphError
 from sst_graph.files.object_store import stored
 from sst_graph.simulator import SimulatedDrive
-from sst_graph.types import NO_PICTURE, CameraImage, Frame, Scan
+from sst_graph.types import NO_PICTURE, CameraImage, Frame, PixelStretch, Scan
 from sst_graph.validation import checked_image, checked_scan
 
 Rng = np.random.Generator
@@ -156,6 +158,9 @@ def test_a_frame_may_be_anything(running: Path) -> None:
     for thing in (None, "frame", 3, np.zeros(3), Frame(0, None, None), Frame(0, "scan", {}), object()):
         update = tracker.add(thing)  # type: ignore[arg-type]
         assert not update.accepted and update.reason
+    for index in (np.zeros(3), "a", 1.5, None, True, 2**80):
+        update = tracker.add(Frame(index, None, None))  # type: ignore[arg-type]
+        assert "frame: found an index" in update.reason
     assert tracker.last_update is not None and tracker.last_update.frame == 0
     tracker.last_update = None
     assert stored(tracker) == before
@@ -206,6 +211,10 @@ def test_a_scan_s_flaw_is_named(
         ("pixels", lambda i: i.pixels[..., 0], r"pixels: found shape .* in BGR"),
         ("pixels", lambda i: i.pixels.astype(np.float32), "dtype float32, expected uint8"),
         ("instances", lambda i: i.mask[:3].astype(np.uint16), "instances: found shape"),
+        ("stretch", lambda i: b"x", "stretch: found a bytes, expected a PixelStretch"),
+        ("stretch", lambda i: PixelStretch(np.ones((1, 4, 3), np.float32), 8), "at least 2 rows"),
+        ("stretch", lambda i: PixelStretch(np.full((3, 4, 3), np.nan, np.float32), 8), "NaN or inf"),
+        ("stretch", lambda i: PixelStretch(np.ones((3, 4, 3), np.float32), 0), "step_px: found 0"),
     ],
 )
 def test_an_image_s_flaw_is_named(
@@ -215,6 +224,31 @@ def test_an_image_s_flaw_is_named(
     assert image is not None
     with pytest.raises(DataError, match=message):
         checked_image(dataclasses.replace(image, **{field: value(image)}), street.camera)
+
+
+NOWHERE = gtsam.Pose3(gtsam.Rot3(), np.full(3, np.nan))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"camera": None}, "camera: found a NoneType, expected a PinholeCamera"),
+        ({"camera": PinholeCamera(np.nan, 1.0, 1.0, 1.0, 10, 10)}, "fx: found nan, expected a finite number"),
+        ({"camera": PinholeCamera(10.0, 10.0, 5.0, 5.0, 0, 0)}, "an image of 0x0 px"),
+        ({"camera": PinholeCamera(10.0, 10.0, 5.0, 5.0, 9.5, 10)}, "width: found a float"),  # type: ignore[arg-type]
+        ({"initial": np.eye(4)}, "initial: found a ndarray, expected a gtsam.Pose3"),
+        ({"initial": NOWHERE}, "initial: found a value that is not finite"),
+        ({"initial_time_offset_s": np.nan}, "initial time offset: found nan"),
+        ({"initial_time_offset_s": 2**80}, "initial time offset: found 1.20893e"),
+        ({"initial_time_offset_s": 10**400}, "initial time offset: found inf"),
+        ({"config": CalibrationConfig()}, "expected a TrackerConfig"),
+    ],
+)
+def test_a_tracker_is_made_of_a_camera_a_guess_and_settings(
+    street: SimulatedDrive, change: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(SstGraphError, match=re.escape(message)):
+        Tracker(**{"camera": street.camera, **change})
 
 
 def test_wider_dtypes_and_other_orders_are_converted(street: SimulatedDrive, frames: list[Frame]) -> None:

@@ -10,12 +10,7 @@ import numpy as np
 
 from sst_graph.batch.by_edges.label_parts import labelled_stamps
 from sst_graph.batch.config import CalibrationConfig, Method
-from sst_graph.data.frame_parts import (
-    checked_image_at,
-    checked_scan_at,
-    image_positions,
-    scan_positions,
-)
+from sst_graph.data.frame_parts import image_at, image_positions, scan_at, scan_positions
 from sst_graph.drive.preparation import Drive
 from sst_graph.sampling import evenly_spread
 from sst_graph.types import SemanticClass, Source
@@ -66,9 +61,9 @@ class _Looks:
     @classmethod
     def at(cls, source: Source) -> _Looks:
         places = evenly_spread(image_positions(source), _LOOKS)
-        images = [image for k in places if (image := checked_image_at(source, k)) is not None]
+        images = [image for k in places if (image := image_at(source, k)) is not None]
         places = evenly_spread(scan_positions(source), _LOOKS)
-        scans = [scan for k in places if (scan := checked_scan_at(source, k)) is not None]
+        scans = [scan for k in places if (scan := scan_at(source, k)) is not None]
         return cls(
             tuple(_classes(scan.classes) for scan in scans),
             tuple(_classes(image.mask) for image in images),

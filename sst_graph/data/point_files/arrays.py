@@ -99,7 +99,13 @@ def _array(data: bytes, path: Path) -> NDArray[Any]:
         shape, fortran, dtype = read_header(stream, max_header_size=_MAX_HEADER)
     except (*_BROKEN, RecursionError, MemoryError) as error:
         raise DataError(path, f"no .npy file ({_line(error)})", "an array that NumPy wrote") from None
-    if dtype.hasobject or dtype.itemsize == 0 or dtype.itemsize > MAX_POINT_BYTES or len(shape) not in (1, 2):
+    if (
+        dtype.subdtype is not None
+        or dtype.hasobject
+        or dtype.itemsize == 0
+        or dtype.itemsize > MAX_POINT_BYTES
+        or len(shape) not in (1, 2)
+    ):
         raise DataError(path, f"an array of {dtype}, shape {shape}", "numbers or structured records")
     count = 1
     for length in shape:

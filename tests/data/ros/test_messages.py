@@ -44,6 +44,16 @@ def test_colours_in_every_order(padding: int) -> None:
     np.testing.assert_array_equal(picture_of(grey, IMAGE, "here"), np.repeat(BGR[..., :1], 3, axis=2))
 
 
+@pytest.mark.parametrize("encoding", ["yuv422", "yuv422_yuy2"])
+def test_a_picture_of_a_size_that_its_encoding_cannot_have(encoding: str) -> None:
+    """Two pixels share their colour, and seven cannot."""
+    even = MAKE.image(STAMP_NS, np.full((6, 8, 2), 128, np.uint8), encoding)
+    assert picture_of(even, IMAGE, "here").shape == (6, 8, 3)
+    odd = MAKE.image(STAMP_NS, np.full((6, 7, 2), 128, np.uint8), encoding)
+    with pytest.raises(DataError, match=f"7x6 px, expected a size that encoding {encoding} can have"):
+        picture_of(odd, IMAGE, "here")
+
+
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
 def test_bayer_patterns_give_the_colour_of_the_scene(pattern: str) -> None:
     colour = {"b": 40, "g": 120, "r": 220}

@@ -1,0 +1,95 @@
+"""What ``calibrate`` is given, of any type: refused in one line before anything is read or solved."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+
+from checks.fuzz import STREET
+from sst_graph import CalibrationConfig, PinholeCamera, TrackerConfig, calibrate
+from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.errors import SstGraphError
+from sst_graph.simulator import simulate
+from sst_graph.types import Frame
+
+
+@pytest.fixture(scope="module")
+def drive() -> KeptDrive:
+    return KeptDrive.of(simulate(STREET))
+
+
+@pytest.mark.parametrize(
+    ("frames", "found"),
+    [
+        (None, "found NoneType"),
+        (5, "found int"),
+        ([], "found list"),
+        ("drive", "a sequence of str"),
+        ({}, "found dict"),
+        (iter(()), "expected a source"),
+        (itertools.count(), "a sequence of int"),
+    ],
+)
+def test_no_source(frames: Any, found: str) -> None:
+    with pytest.raises(SstGraphError, match=found):
+        calibrate(frames)
+
+
+def test_frames_are_no_source(drive: KeptDrive) -> None:
+    def one_by_one() -> Iterator[Frame]:
+        yield from drive
+
+    for frames in (one_by_one(), list(drive), drive[0]):
+        with pytest.raises(SstGraphError, match="Frame, expected a source"):
+            calibrate(frames)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"initial": "Tr"}, "initial: found a str"),
+        ({"initial": gtsam.Pose3(gtsam.Rot3(np.zeros((3, 3))), np.zeros(3))}, "expected a rotation matrix"),
+        ({"initial": gtsam.Pose3(gtsam.Rot3(), np.full(3, 1e200))}, "a translation of 1e+200 m"),
+        ({"initial_time_offset_s": "now"}, "initial time offset: found a str"),
+        ({"initial_time_offset_s": -np.inf}, "initial time offset: found -inf"),
+        ({"config": {}}, "config: found a dict, expected a CalibrationConfig"),
+        ({"config": TrackerConfig()}, "config: found a TrackerConfig"),
+    ],
+)
+def test_guess_and_settings(drive: KeptDrive, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(SstGraphError, match=re.escape(message)):
+        calibrate(drive, **options)
+
+
+@pytest.mark.parametrize("camera", [None, PinholeCamera(np.nan, 1.0, 1.0, 1.0, 10, 10)])
+def test_a_source_without_a_camera(drive: KeptDrive, camera: Any) -> None:
+    with pytest.raises(SstGraphError, match="camera: "):
+        calibrate(dataclasses.replace(drive, camera=camera))
+
+
+@pytest.mark.parametrize("method", ["auto", "joint", "motion", "edges"])
+@pytest.mark.parametrize("part", ["frame", "index", "scan", "points", "image", "mask"])
+def test_a_source_whose_frames_hold_anything(drive: KeptDrive, part: str, method: Any) -> None:
+    first = drive[0]
+    assert first.scan is not None and first.image is not None
+    wrong: Any = {
+        "frame": 3,
+        "index": Frame("a", first.scan, first.image),  # type: ignore[arg-type]
+        "scan": Frame(0, {}, first.image),  # type: ignore[arg-type]
+        "points": Frame(0, dataclasses.replace(first.scan, points=[1]), first.image),  # type: ignore[arg-type]
+        "image": Frame(0, first.scan, "image"),  # type: ignore[arg-type]
+        "mask": Frame(0, first.scan, dataclasses.replace(first.image, mask=first.image.mask[0])),
+    }[part]
+    with pytest.raises(SstGraphError, match="frame"):
+        calibrate(
+            dataclasses.replace(drive, frames=(wrong, *drive.frames[1:])),
+            drive.nominal,
+            CalibrationConfig(method=method),
+        )
