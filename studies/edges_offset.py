@@ -5,8 +5,8 @@
 The score of ``--method edges`` at the reference pose, at time offsets around the reference's; a parabola
 through it has its vertex where this part of the edges wants the time offset. A clock that is off says the
 same in every stretch of frames; a shift of the edges says less the faster the vehicle is, for offset times
-speed is what it shows. Offsets within 5 ms are left out: objects of unknown speed count only there, which lifts the
-score. Real drives are read with ``--image-shift 1``.
+speed is what it shows. Offsets within 5 ms are left out: objects of unknown speed count only there, which
+lifts the score. Real drives are read with ``--image-shift 1``.
 """
 
 from __future__ import annotations
