@@ -163,7 +163,7 @@ def test_opencv(result: CalibrationResult) -> None:
 
 
 def _transform_matrix(record: dict[str, Any]) -> np.ndarray:
-    """nuscenes-devkit's ``transform_matrix`` from sensor to ego (the devkit itself needs NumPy 1)."""
+    """nuscenes-devkit's ``transform_matrix`` from sensor to ego (the devkit asks for NumPy 1)."""
     T = np.eye(4)
     T[:3, :3] = Quaternion(record["rotation"]).rotation_matrix
     T[:3, 3] = np.transpose(np.array(record["translation"]))
