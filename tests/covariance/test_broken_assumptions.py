@@ -31,12 +31,47 @@ def drawn() -> tuple[FloatArray, FloatArray]:
 
 
 @pytest.mark.parametrize("estimate", [0.0, 0.012, 0.03])
-def test_the_mean_square_is_that_of_drawn_parameters(
+def test_the_considered_sigma_is_that_of_drawn_parameters(
     drawn: tuple[FloatArray, FloatArray], estimate: float
 ) -> None:
     thetas, seen = drawn
-    alike = np.abs(seen - estimate) < 0.05 * K1.deviation
-    assert considered_sigma(estimate) == pytest.approx(np.sqrt((thetas[alike] ** 2).mean()), rel=0.05)
+    alike = np.abs(thetas[np.abs(seen - estimate) < 0.05 * K1.deviation])
+    mean_square, tail = (alike**2).mean(), np.quantile(alike, 1.0 - 0.0027)
+    assert considered_sigma(estimate) == pytest.approx(max(np.sqrt(mean_square), tail / 3.0), rel=0.05)
+
+
+def test_three_considered_sigmas_hold_as_often_as_a_normal_distribution_does(
+    drawn: tuple[FloatArray, FloatArray],
+) -> None:
+    thetas, seen = drawn
+    rarely = dataclasses.replace(K1, prevalence=0.02)
+    # The parameters are drawn at another prevalence: weights make up for it.
+    for score in (0.0, 1.0, 2.0, 3.0):
+        alike = np.abs(seen - score * K1.deviation) < 0.05 * K1.deviation
+        sigma = considered_sigmas({"k1": dataclasses.replace(rarely, estimate=score * K1.deviation)})["k1"]
+        holds = np.exp(-0.5 * (thetas[alike] / K1.prior) ** 2) / K1.prior
+        broken = _broken_density(thetas[alike])
+        weights = (0.98 * holds + 0.02 * broken) / (0.5 * holds + 0.5 * broken)
+        beyond = float((weights * (np.abs(thetas[alike]) > 3.0 * sigma)).sum() / weights.sum())
+        assert beyond == pytest.approx(0.0027, rel=0.3)
+
+
+def _broken_density(thetas: FloatArray) -> FloatArray:
+    """Of broken parameters, times the root of 2 pi."""
+    taus = np.geomspace(K1.prior, K1.span, 200)
+    return np.asarray((np.exp(-0.5 * (thetas[:, None] / taus) ** 2) / taus).mean(axis=1))
+
+
+def test_a_small_chance_of_a_large_parameter_widens_the_tail_and_hardly_the_mean_square() -> None:
+    """A principal point of 10.7 +- 5.2 px: the camera matrix may belong to another crop."""
+    crop = Evidence(estimate=10.7, deviation=5.2, prior=0.3, span=30.0, prevalence=0.02)
+    sigma = considered_sigmas({"cx": crop})["cx"]
+    broken = crop.broken()
+    share = 0.02 * broken.factor / (0.98 + 0.02 * broken.factor)
+    root_mean_square = np.sqrt((1.0 - share) * 0.3**2 + share * broken.mean_square)
+    assert root_mean_square < 1.5 < 4.0 < sigma < 10.7
+    # Beyond three of the latter: more than one in 100, not one in 370.
+    assert share * broken.beyond(3.0 * root_mean_square) > 1.0 / 100.0
 
 
 def test_the_considered_sigma_grows_with_the_estimate() -> None:
