@@ -40,8 +40,8 @@ def root_mean_square(evidence: Evidence) -> float:
 
 CONSIDERED: dict[str, Callable[[Evidence], float]] = {
     "prior only": lambda evidence: evidence.prior,
-    "root mean square, prevalence 0.02, deviation with Student's factor": lambda evidence: root_mean_square(
-        replace(evidence, prevalence=0.02, deviation=STUDENT * evidence.deviation)
+    "root mean square, by the test's deviation": lambda evidence: root_mean_square(
+        replace(evidence, deviation=STUDENT * evidence.deviation)
     ),
     "root mean square": root_mean_square,
     "as it is: root mean square or tail": lambda evidence: considered_sigmas({"cx": evidence})["cx"],

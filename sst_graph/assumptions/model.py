@@ -83,8 +83,7 @@ class Assumption:
         source: where ``sigma`` comes from.
         span: deviation when nothing is known of it: the prior of a test, or where it is estimated.
         prevalence: probability beforehand that a set-up breaks the assumption; a judgement: about one camera
-            matrix in twenty belongs to another day, lens, crop or image size. KITTI's two of one camera, two
-            days apart, differ by 0.3 and 0.5 % in focal length and by 14 px in cy.
+            matrix in fifty belongs to another lens, crop or image size.
         violation: what it means that the data contradict it; begins the sentence that reports it.
         remedy: what to do about it.
         by_matches: whether the matches can test it. They cannot test the sweep: at constant speed it looks
@@ -99,7 +98,7 @@ class Assumption:
     span: float
     violation: str
     remedy: str
-    prevalence: float = 0.05
+    prevalence: float = 0.02
     by_matches: bool = True
 
     def figure(self, value: float, sigma: float) -> str:

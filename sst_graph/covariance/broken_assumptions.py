@@ -1,9 +1,9 @@
 """Deviation of an assumption's parameter, given the data, that is considered in the covariance.
 
-Beforehand an assumption either holds, or it is broken, which has probability ``prevalence``. The parameter of
-one that holds is normal with its prior deviation s0. That of a broken one has a deviation tau of its own, of
-which no more is known than its range, from s0 to the assumption's span: log tau is uniform (Jeffreys). An
-estimate t with deviation s changes the odds of each tau by the Bayes factor
+Beforehand either all assumptions hold, or one of them is broken, which has probability ``prevalence``. The
+parameter of one that holds is normal with its prior deviation s0. That of a broken one has a deviation tau of
+its own, of which no more is known than its range, from s0 to the assumption's span: log tau is uniform
+(Jeffreys). An estimate t with deviation s changes the odds of each tau by the Bayes factor
 
     B(tau) = N(t; 0, s^2 + tau^2) / N(t; 0, s^2 + s0^2),
 
@@ -11,12 +11,12 @@ and under each the parameter is normal:
 
     theta | t, tau ~ N(v t / s^2, v),   v = (s^-2 + tau^-2)^-1.
 
-What may be is a mixture, most of it narrow and a small part wide, and no one normal distribution has both its
-mean square and its tails. The considered deviation c is the larger of two:
+At most one assumption is broken, so a deviation in the data is shared among the assumptions that would
+explain it. What may be then is a mixture, most of it narrow and a small part wide, and no one normal
+distribution has both its mean square and its tails. The considered deviation c is the larger of two:
 
-    c^2 = E[theta^2 | t],   P(|theta| > 2.58 c | t) = 1 % = P(|z| > 2.58),   z standard normal,
+    c^2 = E[theta^2 | t],   P(|theta| > 2.33 c | t) = 2 % = P(|z| > 2.33),   z standard normal.
 
-so that intervals of the covariance hold where the assumption does, and where it is broken nearly as often.
 An assumption that holds keeps its prior s0.
 """
 
@@ -33,7 +33,7 @@ FloatArray = NDArray[np.float64]
 
 _SCALES = 24
 """Deviations of a broken assumption's parameter that the average runs over: a factor of 2 apart at most."""
-_RARE, _RARE_SIGMAS = 0.01, 2.5758
+_RARE, _RARE_SIGMAS = 0.02, 2.3263
 """A probability, and the sigmas that a normal variable exceeds with it, in either sense."""
 _HALVINGS = 40
 """Of the interval in which the tail is sought."""
@@ -108,25 +108,23 @@ def _log_normal(value: float, variances: FloatArray) -> FloatArray:
 def considered_sigmas(evidence: Mapping[str, Evidence]) -> dict[str, float]:
     """Deviation of each assumption's parameter from zero, by name, that the estimate is to be covered for.
 
-    Each is judged by its own estimate: one deviation in the data widens all that would explain it. Never
-    below the prior one; that stays 0 where it is 0: the assumption holds exactly.
+    Never below the prior one; that stays 0 where it is 0: the assumption holds exactly.
     """
-    return {name: _considered_sigma(each) for name, each in evidence.items()}
-
-
-def _considered_sigma(evidence: Evidence) -> float:
-    prior, prevalence = evidence.prior, evidence.prevalence
-    if not 0.0 < prior < evidence.span:
-        return prior
-    broken = evidence.broken()
-    odds = prevalence * broken.factor
-    share = odds / (1.0 - prevalence + odds)
-    root_mean_square = float(np.sqrt((1.0 - share) * prior**2 + share * broken.mean_square))
-    return max(prior, root_mean_square, _sigma_of_tail(broken, share, prior))
+    open_ = {name: each for name, each in evidence.items() if 0.0 < each.prior < each.span}
+    broken = {name: each.broken() for name, each in open_.items()}
+    odds = {name: open_[name].prevalence * each.factor for name, each in broken.items()}
+    none = max(1.0 - sum(each.prevalence for each in open_.values()), 0.0)
+    total = none + sum(odds.values())
+    sigmas = {name: each.prior for name, each in evidence.items()}
+    for name, each in broken.items():
+        share, prior = odds[name] / total, sigmas[name]
+        root_mean_square = float(np.sqrt((1.0 - share) * prior**2 + share * each.mean_square))
+        sigmas[name] = max(prior, root_mean_square, _sigma_of_tail(each, share, prior))
+    return sigmas
 
 
 def _sigma_of_tail(broken: BrokenParameter, share: float, prior: float) -> float:
-    """The c that the parameter exceeds by 2.58 as often as a normal variable of that deviation.
+    """The c whose 2.33-fold the parameter exceeds as often as a normal variable of that deviation.
 
     Args:
         share: probability that the assumption is broken.
@@ -136,7 +134,7 @@ def _sigma_of_tail(broken: BrokenParameter, share: float, prior: float) -> float
     def often(size: float) -> bool:
         return share * broken.beyond(size) + (1.0 - share) * 2.0 * float(ndtr(-size / prior)) > _RARE
 
-    # Chebyshev's inequality bounds the size that is exceeded with 1 %.
+    # Chebyshev's inequality bounds the size that is exceeded with 2 %.
     low, high = 0.0, 10.0 * float(np.sqrt(broken.mean_square + prior**2))
     for _ in range(_HALVINGS):
         size = 0.5 * (low + high)

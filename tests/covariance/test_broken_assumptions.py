@@ -36,23 +36,24 @@ def test_the_considered_sigma_is_that_of_drawn_parameters(
 ) -> None:
     thetas, seen = drawn
     alike = np.abs(thetas[np.abs(seen - estimate) < 0.05 * K1.deviation])
-    mean_square, tail = (alike**2).mean(), np.quantile(alike, 0.99)
-    assert considered_sigma(estimate) == pytest.approx(max(np.sqrt(mean_square), tail / 2.576), rel=0.05)
+    mean_square, tail = (alike**2).mean(), np.quantile(alike, 0.98)
+    assert considered_sigma(estimate) == pytest.approx(max(np.sqrt(mean_square), tail / 2.326), rel=0.05)
 
 
-def test_the_tail_of_a_rarely_broken_assumption_is_that_of_a_normal_distribution(
+def test_the_tail_of_a_rarely_broken_assumption_is_at_most_that_of_a_normal_distribution(
     drawn: tuple[FloatArray, FloatArray],
 ) -> None:
     thetas, seen = drawn
-    prevalence = 0.05
+    prevalence, rates = 0.02, []
     # The parameters are drawn at another prevalence: weights make up for it.
     for score in (0.0, 1.0, 2.0, 3.0):
         alike = thetas[np.abs(seen - score * K1.deviation) < 0.05 * K1.deviation]
         sigma = considered_sigma(score * K1.deviation, prevalence=prevalence)
         holds, broken = np.exp(-0.5 * (alike / K1.prior) ** 2) / K1.prior, _broken_density(alike)
         weights = ((1.0 - prevalence) * holds + prevalence * broken) / (0.5 * holds + 0.5 * broken)
-        beyond = float((weights * (np.abs(alike) > 2.576 * sigma)).sum() / weights.sum())
-        assert beyond == pytest.approx(0.01, rel=0.15)
+        rates.append(float((weights * (np.abs(alike) > 2.326 * sigma)).sum() / weights.sum()))
+    # Where the mean square is larger than the tail asks for, fewer lie beyond.
+    assert max(rates) == pytest.approx(0.02, rel=0.15)
 
 
 def _broken_density(thetas: FloatArray) -> FloatArray:
@@ -62,15 +63,15 @@ def _broken_density(thetas: FloatArray) -> FloatArray:
 
 
 def test_a_small_chance_of_a_large_parameter_widens_the_tail_more_than_the_mean_square() -> None:
-    """A principal point of 10.7 +- 5.2 px: the camera matrix may belong to another crop."""
-    crop = Evidence(estimate=10.7, deviation=5.2, prior=0.3, span=30.0, prevalence=0.05)
+    """A principal point of 10.7 +- 3.4 px: the camera matrix may belong to another crop."""
+    crop = Evidence(estimate=10.7, deviation=3.4, prior=0.3, span=30.0, prevalence=0.02)
     sigma = considered_sigmas({"cx": crop})["cx"]
     broken = crop.broken()
-    share = 0.05 * broken.factor / (0.95 + 0.05 * broken.factor)
+    share = 0.02 * broken.factor / (0.98 + 0.02 * broken.factor)
     root_mean_square = np.sqrt((1.0 - share) * 0.3**2 + share * broken.mean_square)
-    assert root_mean_square < 2.1 < 4.0 < sigma < 10.7
-    # Beyond 2.58 of the latter: more than one in 50, not one in 100.
-    assert share * broken.beyond(2.576 * root_mean_square) > 0.02
+    assert 3.0 < root_mean_square < 5.0 < sigma < 10.7
+    # Beyond 2.33 of the latter: more than one in 20, not one in 50.
+    assert share * broken.beyond(2.326 * root_mean_square) > 0.05
 
 
 def test_the_considered_sigma_grows_with_the_estimate() -> None:
@@ -92,15 +93,15 @@ def test_what_holds_exactly_is_never_considered() -> None:
     assert considered_sigma(0.1, prior=0.0) == 0.0
 
 
-def test_each_assumption_is_judged_by_its_own_estimate() -> None:
+def test_two_assumptions_share_one_deviation() -> None:
     seen = dataclasses.replace(K1, estimate=0.02, prevalence=0.2)
-    alone, both = considered_sigmas({"a": seen}), considered_sigmas({"a": seen, "b": K1})
-    assert both["a"] == alone["a"] > both["b"] > K1.prior
+    alone, both = considered_sigmas({"a": seen}), considered_sigmas({"a": seen, "b": seen})
+    assert K1.prior < both["b"] == both["a"] < alone["a"]
 
 
 def test_a_huge_estimate_gives_a_finite_sigma() -> None:
     assert considered_sigma(1e6) == pytest.approx(1e6 * (0.3**2 / (0.3**2 + 0.008**2)), rel=0.1)
 
 
-def test_every_assumption_may_hold_and_may_be_broken() -> None:
-    assert all(0.0 < each.prevalence < 1.0 for each in ASSUMPTIONS.values() if each.by_matches)
+def test_all_assumptions_together_leave_room_for_none_broken() -> None:
+    assert 0.0 < sum(each.prevalence for each in ASSUMPTIONS.values()) < 1.0
