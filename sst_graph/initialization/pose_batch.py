@@ -147,9 +147,10 @@ class _Fields:
             if len(self._kept) >= _KEPT_FIELDS:
                 self._kept.pop(next(iter(self._kept)))
             field = image.contours.get(kind)
-            stored = isinstance(field, ContourMap)
             self._kept[key] = (
-                replace(field, distance=field.distance, unknown=field.unknown) if stored else None
+                replace(field, distance=field.distance, unknown=field.unknown)
+                if isinstance(field, ContourMap)
+                else None
             )
         return self._kept[key]
 
