@@ -147,9 +147,11 @@ class _Fields:
             if len(self._kept) >= _KEPT_FIELDS:
                 self._kept.pop(next(iter(self._kept)))
             field = image.contours.get(kind)
-            self._kept[key] = None
-            if isinstance(field, ContourMap):
-                self._kept[key] = replace(field, distance=field.distance, unknown=field.unknown)
+            self._kept[key] = (
+                replace(field, distance=field.distance, unknown=field.unknown)
+                if isinstance(field, ContourMap)
+                else None
+            )
         return self._kept[key]
 
 
