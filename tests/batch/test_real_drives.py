@@ -19,8 +19,11 @@ STOP, PARKED = DATA / "kitti_2011_09_26_stop", DATA / "kitti_2011_09_26_parked"
 @pytest.mark.skipif(not STOP.is_dir(), reason="no ../shared")
 @pytest.mark.parametrize(("shift", "status"), [(0, "ok"), (3, "unobservable")])
 def test_a_slow_drive_with_a_stop(shift: int, status: str) -> None:
-    """Images up to 310 ms late. The reference is good to 0.1 deg, 1 cm and 5 ms. The labels of nine objects say
-    k1 = 0.0175, 2.7 of its standard deviations from 0, and so much is considered, which is at the limit of ok."""
+    """Images up to 310 ms late. The reference is good to 0.1 deg, 1 cm and 5 ms.
+
+    The labels of nine objects say k1 = 0.0175, 2.7 of its standard deviations from 0. So much is
+    considered, which is at the limit of ok.
+    """
     drive = open_source(STOP, image_shift=shift)
     result = calibrate(drive, drive.nominal, CalibrationConfig())
     assert drive.truth is not None
