@@ -9,6 +9,7 @@ so that lost workers say nothing of it.
 from __future__ import annotations
 
 import logging
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
@@ -23,6 +24,9 @@ from sst_graph.fleet.record import Record
 LOCAL = "local"
 """In the place of an address: a cluster on this machine, started for the batch."""
 _PATIENCE_S, _CONNECT_S = 0.5, 20.0
+_WITHOUT_WORKERS_S = 10.0
+"""A local cluster without any worker for this long gets new ones: a nanny gives up a worker that is killed
+while it starts."""
 _MOST_ROUNDS = 3
 """How often a drive is given to the scheduler; an end is needed where all workers are killed for ever."""
 _AHEAD = 4
@@ -56,6 +60,7 @@ def run_on_dask(
         waiting = iter(jobs)
         running: dict[Any, Job] = {}
         rounds: Counter[str] = Counter()
+        renewal = _Renewal(client.cluster if cluster.address == LOCAL else None, cluster.workers)
 
         def submit(job: Job) -> None:
             name = job.drive.name
@@ -63,7 +68,9 @@ def run_on_dask(
             running[client.submit(run, job, pure=False, key=f"sst-graph-{name}-{rounds[name]}")] = job
 
         while True:
-            threads = sum(one["nthreads"] for one in client.scheduler_info(n_workers=-1)["workers"].values())
+            workers = client.scheduler_info(n_workers=-1)["workers"].values()
+            renewal.look(len(workers))
+            threads = sum(one["nthreads"] for one in workers)
             for job in islice(waiting, max(_AHEAD * max(threads, 1) - len(running), 0)):
                 submit(job)
             if not running:
@@ -116,6 +123,25 @@ def _client(distributed: Any, cluster: Cluster) -> Any:
         return distributed.Client(cluster.address, timeout=_CONNECT_S)
     except (OSError, ValueError, TimeoutError) as error:
         raise ConfigError(f"--dask {cluster.address}: found no scheduler ({error})") from error
+
+
+class _Renewal:
+    """New workers for a local cluster that has lost all of them."""
+
+    def __init__(self, cluster: Any, workers: int) -> None:
+        """cluster: None for one of others, which see to their workers themselves."""
+        self._cluster, self._workers = cluster, workers
+        self._last_seen = time.monotonic()
+
+    def look(self, workers: int) -> None:
+        """Tell how many workers there are now."""
+        now = time.monotonic()
+        if workers or self._cluster is None:
+            self._last_seen = now
+        elif now - self._last_seen > _WITHOUT_WORKERS_S:
+            self._cluster.scale(0)
+            self._cluster.scale(self._workers)
+            self._last_seen = now
 
 
 class _OwnCluster:

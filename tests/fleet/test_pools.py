@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -70,6 +72,31 @@ def test_dask_repeats_what_a_lost_worker_had(tmp_path: Path) -> None:
     assert found["drive_0005"].status == "killed" and "Dask workers were lost" in found["drive_0005"].reason
     assert len((tmp_path / "drive_0004").read_text()) >= 4
     assert len((tmp_path / "drive_0005").read_text()) <= 6
+
+
+@pytest.mark.slow
+def test_workers_that_are_killed_while_they_start_are_replaced() -> None:
+    """Dask's nannies give such workers up; with none left the batch would wait for ever."""
+    pytest.importorskip("distributed")
+    psutil = pytest.importorskip("psutil")
+    until = time.monotonic() + 15.0
+    killed, done = set(), []
+    for one in run_on_dask(jobs(20), Cluster("local", 2), lingering):
+        done += [one] if one else []
+        if time.monotonic() < until:
+            for process in psutil.Process().children(recursive=True):
+                with contextlib.suppress(psutil.NoSuchProcess):
+                    if "spawn_main" in " ".join(process.cmdline()):
+                        killed.add(process.pid)
+                        process.kill()
+    assert len(killed) > 4
+    assert sorted(one.drive for one in done) == [job.drive.name for job in jobs(20)]
+    assert [one.status for one in done] == ["ok"] * 20
+
+
+def lingering(job: Job) -> Record:
+    time.sleep(1.0)
+    return instant(job)
 
 
 def broken(job: Job) -> Record:
