@@ -57,15 +57,12 @@ class ParameterTest:
         assumption: which.
         value, sigma: estimate and its deviation, in the parameter's unit.
         contradicted: whether the assumption is contradicted.
-        few_objects: the factor of ``sigma`` by :func:`few_objects_factor`; without it, ``sigma`` is the
-            estimate's standard deviation, with it what the threshold is compared with.
     """
 
     assumption: Assumption
     value: float
     sigma: float
     contradicted: bool
-    few_objects: float = 1.0
 
     def __getstate__(self) -> dict[str, Any]:
         """The assumption by its name: its effect is a function, which cannot be stored."""
@@ -201,9 +198,9 @@ class LinearProblem:
         column = self.unknowns.column(nuisance_key(name))
         place = int(np.searchsorted(kept, column))
         sigma = float(np.sqrt(covariance[place, place]))
-        few = few_objects_factor(int(table.objects.max()) + 1, config.threshold)
-        value, sigma = self.values[name] + float(step[column]), few * sigma
-        return ParameterTest(ASSUMPTIONS[name], value, sigma, abs(value) > config.threshold * sigma, few)
+        sigma *= few_objects_factor(int(table.objects.max()) + 1, config.threshold)
+        value = self.values[name] + float(step[column])
+        return ParameterTest(ASSUMPTIONS[name], value, sigma, abs(value) > config.threshold * sigma)
 
     def start_of(self, finding: ParameterTest) -> State:
         """Predicted state of a solution with a finding's parameter alone."""
@@ -258,11 +255,10 @@ def _solved_alone(
     )
     column = robust.unknowns.column(nuisance_key(name))
     value, sigma = solution.state.nuisances[name], float(np.sqrt(robust.matrix[column, column]))
-    few = few_objects_factor(int(robust.table.objects.max()) + 1, config.threshold)
-    sigma *= few
+    sigma *= few_objects_factor(int(robust.table.objects.max()) + 1, config.threshold)
     alike = abs(value - finding.value) < config.threshold * max(sigma, finding.sigma)
     same = alike and abs(value) > config.threshold * sigma
-    return replace(finding, value=value, sigma=sigma, few_objects=few) if same else finding
+    return replace(finding, value=value, sigma=sigma) if same else finding
 
 
 def few_objects_factor(objects: int, threshold: float) -> float:
@@ -277,15 +273,11 @@ def few_objects_factor(objects: int, threshold: float) -> float:
 
 
 def with_test_results(considered: Considered, findings: Sequence[ParameterTest]) -> Considered:
-    """The considered assumptions, with larger deviations for parameters that the tests leave open.
-
-    By the estimates' standard deviations: Student's factor is that of a rare event, and would make two
-    deviations look like one.
-    """
+    """The considered assumptions, with larger deviations for parameters that the tests leave open."""
     evidence = {
         f.assumption.name: Evidence(
             f.value,
-            f.sigma / f.few_objects,
+            f.sigma,
             considered.sigmas[f.assumption.name],
             f.assumption.span,
             f.assumption.prevalence,

@@ -31,47 +31,12 @@ def drawn() -> tuple[FloatArray, FloatArray]:
 
 
 @pytest.mark.parametrize("estimate", [0.0, 0.012, 0.03])
-def test_the_considered_sigma_is_that_of_drawn_parameters(
+def test_the_mean_square_is_that_of_drawn_parameters(
     drawn: tuple[FloatArray, FloatArray], estimate: float
 ) -> None:
     thetas, seen = drawn
-    alike = np.abs(thetas[np.abs(seen - estimate) < 0.05 * K1.deviation])
-    mean_square, tail = (alike**2).mean(), np.quantile(alike, 0.98)
-    assert considered_sigma(estimate) == pytest.approx(max(np.sqrt(mean_square), tail / 2.326), rel=0.05)
-
-
-def test_the_tail_of_a_rarely_broken_assumption_is_at_most_that_of_a_normal_distribution(
-    drawn: tuple[FloatArray, FloatArray],
-) -> None:
-    thetas, seen = drawn
-    prevalence, rates = 0.02, []
-    # The parameters are drawn at another prevalence: weights make up for it.
-    for score in (0.0, 1.0, 2.0, 3.0):
-        alike = thetas[np.abs(seen - score * K1.deviation) < 0.05 * K1.deviation]
-        sigma = considered_sigma(score * K1.deviation, prevalence=prevalence)
-        holds, broken = np.exp(-0.5 * (alike / K1.prior) ** 2) / K1.prior, _broken_density(alike)
-        weights = ((1.0 - prevalence) * holds + prevalence * broken) / (0.5 * holds + 0.5 * broken)
-        rates.append(float((weights * (np.abs(alike) > 2.326 * sigma)).sum() / weights.sum()))
-    # Where the mean square is larger than the tail asks for, fewer lie beyond.
-    assert max(rates) == pytest.approx(0.02, rel=0.15)
-
-
-def _broken_density(thetas: FloatArray) -> FloatArray:
-    """Of broken parameters, times the root of 2 pi."""
-    taus = np.geomspace(K1.prior, K1.span, 200)
-    return np.asarray((np.exp(-0.5 * (thetas[:, None] / taus) ** 2) / taus).mean(axis=1))
-
-
-def test_a_small_chance_of_a_large_parameter_widens_the_tail_more_than_the_mean_square() -> None:
-    """A principal point of 10.7 +- 3.4 px: the camera matrix may belong to another crop."""
-    crop = Evidence(estimate=10.7, deviation=3.4, prior=0.3, span=30.0, prevalence=0.02)
-    sigma = considered_sigmas({"cx": crop})["cx"]
-    broken = crop.broken()
-    share = 0.02 * broken.factor / (0.98 + 0.02 * broken.factor)
-    root_mean_square = np.sqrt((1.0 - share) * 0.3**2 + share * broken.mean_square)
-    assert 3.0 < root_mean_square < 5.0 < sigma < 10.7
-    # Beyond 2.33 of the latter: more than one in 20, not one in 50.
-    assert share * broken.beyond(2.326 * root_mean_square) > 0.05
+    alike = np.abs(seen - estimate) < 0.05 * K1.deviation
+    assert considered_sigma(estimate) == pytest.approx(np.sqrt((thetas[alike] ** 2).mean()), rel=0.05)
 
 
 def test_the_considered_sigma_grows_with_the_estimate() -> None:
