@@ -71,7 +71,7 @@ def hand_eye_covariance(
     bread = _inverse_without(hessian, NOISE_INFORMATION_MARGIN * _noise_information(terms))
     scores = (np.swapaxes(J, 1, 2) @ r[..., None])[..., 0]
     # The rows of a direction that is not used are 0 in J.
-    moved = np.swapaxes(J, 1, 2) @ terms.roots
+    moved = np.swapaxes(J, 1, 2) @ np.linalg.inv(np.linalg.cholesky(terms.covariances))
     seconds = 1e-9 * np.array([camera.to_ns - camera.from_ns for camera in cameras])
     shared = np.zeros((7, 6))
     shared[:, :3] = np.radians(errors.turn_rate_deg_s) * np.tensordot(seconds, moved[:, :, :3], 1)
