@@ -29,7 +29,6 @@ from sst_graph.edges.search import (
     SearchRegion,
     angle_deg,
     edge_starts,
-    spread_evenly,
     turned,
 )
 from sst_graph.errors import EstimationError
@@ -38,6 +37,7 @@ from sst_graph.graph.matching import DriveEdges, edges_of
 from sst_graph.graph.outer_loop import JointProblem, JointSolution, solve_joint
 from sst_graph.graph.state import State
 from sst_graph.hand_eye.solution import MotionSolution, alternative, difference, solve_motion
+from sst_graph.sampling import evenly_spread
 
 FloatArray = NDArray[np.float64]
 
@@ -59,6 +59,8 @@ _RESTARTS = 4
 """Most times that a better optimum is followed."""
 _BETTER = 1.005
 """Its score is higher by this factor: smaller differences are those of one optimum reached twice."""
+_GAIN = 1.001
+"""A round that raises the score by less than this factor is the last, where only scores are compared."""
 _GUESS_SIGMA_DEG = 3.5
 """Sigma, by axis, of the rotation of a guess that starts are searched around [deg]."""
 _REACH_SIGMAS, _MOST_DEG = 2.2, 25.0
@@ -232,7 +234,7 @@ def _some_scans(drive: Drive, time_offset_s: float) -> list[int]:
     found = pair_by_time(drive.scan_stamps_ns, drive.image_stamps_ns, time_offset_s, drive.image_period_s)
     scans = sorted({pair.scan for pair in found if not drive.have_labels(pair.scan, pair.image)})
     scans = scans or list(range(len(drive.scans)))
-    return [scans[k] for k in spread_evenly(len(scans), SEARCH_SCANS)]
+    return evenly_spread(scans, SEARCH_SCANS)
 
 
 def _tells_offset(motion: MotionSolution) -> bool:
@@ -334,16 +336,16 @@ def _refined(problem: _Problem, starts: Sequence[State]) -> list[tuple[float, Jo
 def _best_optimum(problem: _Problem, start: State, restarts: int, progress: Progress | None) -> JointSolution:
     """The solution on all scans that no turn leads away from to a better one."""
     wide = solve_joint(problem.whole, start, KERNELS_PX, progress)
-    best = _settled(problem.whole, wide.state, progress)
+    best, agreed = _climbed(problem.whole, wide.state, progress)
     for _ in range(restarts):
-        other = _better_on_some(problem, best.state)
+        other = _better_on_some(problem, best)
         if other is None:
             break
-        again = _settled(problem.whole, other, progress)
-        if _score(problem.whole, again.state) < _BETTER * _score(problem.whole, best.state):
+        again, agrees = _climbed(problem.whole, other, progress)
+        if agrees < _BETTER * agreed:
             break
-        best = again
-    return best
+        best, agreed = again, agrees
+    return _settled(problem.whole, best, progress)
 
 
 def _better_on_some(problem: _Problem, state: State) -> State | None:
@@ -354,18 +356,28 @@ def _better_on_some(problem: _Problem, state: State) -> State | None:
     found = []
     for start in starts:
         try:
-            found.append(_settled(problem.some, start, None).state)
+            found.append(_climbed(problem.some, start, None))
         except EstimationError:
             if start is state:
                 return None
-    own, *others = [_score(problem.some, each) for each in found]
-    if not others or max(others) < _BETTER * own:
-        return None
-    return found[1 + int(np.argmax(others))]
+    (_, own), *others = found
+    other, agrees = max(others, key=lambda one: one[1], default=(state, 0.0))
+    return other if agrees >= _BETTER * own else None
 
 
-def _score(problem: JointProblem, state: State) -> float:
-    return score(edges_of(problem.drives, problem.tracks, problem.config.graph), state, SCORE_PX)
+def _climbed(problem: JointProblem, start: State, progress: Progress | None) -> tuple[State, float]:
+    """A state near the optimum that a start leads to, and its score, by few long steps: each point is matched
+    to the peak of its edge, which Newton's method says, until the score gains too little to count."""
+    graph = replace(problem.config.graph, edge_peaks=True)
+    by_peaks = replace(problem, config=replace(problem.config, graph=graph))
+    edges = edges_of(problem.drives, problem.tracks, graph)
+    state, agrees = start, 0.0
+    for _ in range(_ROUNDS):
+        state = solve_joint(by_peaks, state, NEAR_KERNELS_PX, progress).state
+        before, agrees = agrees, score(edges, state, SCORE_PX)
+        if agrees < _GAIN * before:
+            break
+    return state, agrees
 
 
 def _settled(problem: JointProblem, start: State, progress: Progress | None) -> JointSolution:
