@@ -93,7 +93,7 @@ def test_a_measured_page_names_the_command_of_its_tables(path: Path) -> None:
     page = path.read_text(encoding="utf-8")
     code = " ".join(re.findall(r"```.*?```|`[^`]+`|\]\([^)]+\)", page, re.DOTALL))
     assert COMMAND.search(code), "found tables, expected the command that makes them"
-    if "in a checkout of that commit" in page:  # which has programs that are no longer here
+    if "in a checkout of that commit" in page:
         return
     programs = re.findall(r"(?:benchmarks|studies|checks|docs/figures)[\w/]*\.py\b", code)
     assert all((ROOT / program).is_file() for program in programs)

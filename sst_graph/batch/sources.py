@@ -11,22 +11,24 @@ from sst_graph.types import Source
 from sst_graph.validation import checked_intrinsics
 
 _MOST = 10_000
-"""Drives of one calibration."""
+"""Most drives of one calibration."""
 
 
 def as_sources(frames: Source | Sequence[Source]) -> list[Source]:
     """Sources in a list.
 
     Raises:
-        DataError: neither a source nor a sequence of sources with at least one frame each.
+        DataError: neither a source nor a sequence of sources with at least one frame each, or too many.
     """
     sources: list[Any] = [frames]
     if not _is_source(frames):
         # What is endless is no sequence of drives.
-        sources = list(islice(frames, _MOST)) if isinstance(frames, Iterable) else []
+        sources = list(islice(frames, _MOST + 1)) if isinstance(frames, Iterable) else []
     if not sources or not all(_is_source(source) for source in sources):
         found = type(frames).__name__ if not sources else f"a sequence of {type(sources[0]).__name__}"
         raise DataError("frames to calibrate", found, "a source (open_source), a slice of one, or several")
+    if len(sources) > _MOST:
+        raise DataError("frames to calibrate", f"more than {_MOST} drives", "so many at most")
     for source in sources:
         if len(source) == 0:
             raise DataError(source.name, "no frame", "one or more")

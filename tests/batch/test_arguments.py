@@ -42,6 +42,11 @@ def test_no_source(frames: Any, found: str) -> None:
         calibrate(frames)
 
 
+def test_drives_without_end(drive: KeptDrive) -> None:
+    with pytest.raises(SstGraphError, match="found more than 10000 drives"):
+        calibrate(itertools.repeat(drive))  # type: ignore[arg-type]
+
+
 def test_frames_are_no_source(drive: KeptDrive) -> None:
     def one_by_one() -> Iterator[Frame]:
         yield from drive
