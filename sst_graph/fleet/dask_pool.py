@@ -2,15 +2,15 @@
 
 A task runs one drive as the local pool does, in a process of its own below the Dask worker. Where a worker is
 lost, the scheduler repeats its task elsewhere; a result that is whole by then is taken as it is. What the
-scheduler gives up (by default after four lost workers) is given to it again: a drive cannot end its worker,
-so that lost workers say nothing of it.
+scheduler gives up (by default after four lost workers) is given to it again, the last time by itself, when
+all else is done: a lost worker counts against every task that waits on it.
 """
 
 from __future__ import annotations
 
 import logging
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
@@ -28,7 +28,8 @@ _WITHOUT_WORKERS_S = 10.0
 """A local cluster without any worker for this long gets new ones: a nanny gives up a worker that is killed
 while it starts."""
 _MOST_ROUNDS = 3
-"""How often a drive is given to the scheduler; an end is needed where all workers are killed for ever."""
+"""How often a drive is given to the scheduler, the last time with no other beside it; an end is needed where
+all workers are killed for ever."""
 _AHEAD = 4
 """Tasks at the scheduler for each that can run: enough that none waits, few enough for its memory."""
 
@@ -59,6 +60,7 @@ def run_on_dask(
     with _client(distributed, cluster) as client:
         waiting = iter(jobs)
         running: dict[Any, Job] = {}
+        alone: deque[Job] = deque()
         rounds: Counter[str] = Counter()
         renewal = _Renewal(client.cluster if cluster.address == LOCAL else None, cluster.workers)
 
@@ -73,6 +75,8 @@ def run_on_dask(
             threads = sum(one["nthreads"] for one in workers)
             for job in islice(waiting, max(_AHEAD * max(threads, 1) - len(running), 0)):
                 submit(job)
+            if not running and alone:
+                submit(alone.popleft())
             if not running:
                 return
             try:
@@ -90,8 +94,10 @@ def run_on_dask(
             for future in done:
                 job, error = running.pop(future), future.exception()
                 is_lost = isinstance(error, distributed.KilledWorker)
-                if is_lost and rounds[job.drive.name] < _MOST_ROUNDS:
+                if is_lost and rounds[job.drive.name] + 1 < _MOST_ROUNDS:
                     submit(job)
+                elif is_lost and rounds[job.drive.name] < _MOST_ROUNDS:
+                    alone.append(job)
                 else:
                     del rounds[job.drive.name]
                     yield _record(future, job, error, is_lost)
