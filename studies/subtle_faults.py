@@ -13,6 +13,7 @@ import cv2
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.experiments.wrong_drives import with_elevation
@@ -464,6 +465,108 @@ def half_compensated(drive: KeptDrive, seconds: float) -> KeptDrive:
     return with_numbered_scans(drive, lambda k, s: replace(s, stamp_ns=s.stamp_ns - early))
 
 
+def stretched(drive: KeptDrive, factor: float) -> KeptDrive:
+    """Pictures and masks higher by a factor about their middle row, the focal lengths as before."""
+    shape = (drive.camera.width, drive.camera.height)
+    M = np.array([[1.0, 0.0, 0.0], [0.0, factor, 0.5 * shape[1] * (1.0 - factor)]])
+    return with_warped_pictures(
+        drive, lambda array, how: cv2.warpAffine(array, M, shape, flags=how, borderMode=cv2.BORDER_REPLICATE)
+    )
+
+
+def tangentially_distorted(drive: KeptDrive, p1: float) -> KeptDrive:
+    """A lens that stands askew: plumb-bob distortion p1, which the camera does not know."""
+    camera = drive.camera
+    K = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+    columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2).astype(np.float64)
+    at = cv2.undistortPoints(pixels, K, np.array([0.0, 0.0, p1, 0.0]), P=K)
+    at = at.reshape(camera.height, camera.width, 2).astype(np.float32)
+    return with_warped_pictures(
+        drive, lambda array, how: cv2.remap(array, at, None, how, borderMode=cv2.BORDER_REPLICATE)
+    )
+
+
+def with_warped_pictures(
+    drive: KeptDrive, warp: Callable[[NDArray[np.uint8], int], NDArray[np.uint8]]
+) -> KeptDrive:
+    """Pictures and masks by ``warp``, which takes an array and how to interpolate."""
+    return drive.with_images(
+        lambda i: replace(
+            i,
+            mask=warp(i.mask, cv2.INTER_NEAREST),
+            pixels=warp(i.pixels, cv2.INTER_LINEAR),
+            instances=None,
+        )
+    )
+
+
+def in_polar(scan: Scan, azimuth: FloatArray, elevation: FloatArray) -> Scan:
+    """A scan whose points have other azimuths and elevations [rad] and the same ranges."""
+    ranges = np.linalg.norm(scan.points.astype(np.float64), axis=1)
+    across = ranges * np.cos(elevation)
+    points = [across * np.cos(azimuth), across * np.sin(azimuth), ranges * np.sin(elevation)]
+    return replace(scan, points=np.stack(points, axis=1).astype(np.float32))
+
+
+def wider_beams(drive: KeptDrive, factor: float) -> KeptDrive:
+    """Elevations larger by a factor: the table of the beams is that of another LiDAR of the kind."""
+    return drive.with_scans(
+        lambda s: in_polar(s, np.radians(_azimuth_deg(s)), factor * np.radians(_elevation_deg(s)))
+    )
+
+
+def eccentric_encoder(drive: KeptDrive, degrees: float) -> KeptDrive:
+    """Azimuths wrong by a sine of themselves: the encoder's disc is not centred."""
+
+    def turned(scan: Scan) -> Scan:
+        azimuth = np.radians(_azimuth_deg(scan))
+        wrong = azimuth + np.radians(degrees) * np.sin(azimuth + 0.5)
+        return in_polar(scan, wrong, np.radians(_elevation_deg(scan)))
+
+    return drive.with_scans(turned)
+
+
+def bleeding_labels(drive: KeptDrive, degrees: float, one_side: bool) -> KeptDrive:
+    """Points beside a vehicle labelled vehicle, whatever their range: networks on range images do so."""
+    window = np.radians(degrees)
+
+    def labelled(scan: Scan) -> Scan:
+        direction = np.stack([np.radians(_azimuth_deg(scan)), 3.0 * np.radians(_elevation_deg(scan))], axis=1)
+        vehicle = scan.classes == SemanticClass.VEHICLE
+        if not vehicle.any() or vehicle.all():
+            return scan
+        shifted = direction - ([0.5 * window, 0.0] if one_side else [0.0, 0.0])
+        reach = 0.5 * window if one_side else window
+        near = KDTree(direction[vehicle]).query(shifted, distance_upper_bound=reach)[0] < np.inf
+        classes = scan.classes.copy()
+        classes[near] = SemanticClass.VEHICLE
+        return replace(scan, classes=classes, instances=None)
+
+    return drive.with_scans(labelled)
+
+
+def noisy_ranges(drive: KeptDrive, metres: float) -> KeptDrive:
+    """Ranges with a normal error: a cheap LiDAR."""
+    rng = np.random.default_rng(14)
+
+    def noisy(scan: Scan) -> Scan:
+        ranges = np.linalg.norm(scan.points, axis=1, keepdims=True)
+        longer = 1.0 + metres * rng.standard_normal((len(ranges), 1)) / np.maximum(ranges, 0.5)
+        return replace(scan, points=(scan.points * longer).astype(np.float32))
+
+    return drive.with_scans(noisy)
+
+
+def lowered_masks(drive: KeptDrive, rows: int) -> KeptDrive:
+    """Masks some rows lower than the pictures: padded at the top and not cut again."""
+    return drive.with_images(
+        lambda i: replace(
+            i, mask=np.concatenate([np.repeat(i.mask[:1], rows, 0), i.mask[:-rows]]), instances=None
+        )
+    )
+
+
 SUBTLE_FAULTS: dict[str, SubtleFault] = {
     "every second picture repeated": repeated_pictures,
     "every second scan repeated": repeated_scans,
@@ -509,6 +612,14 @@ SUBTLE_FAULTS: dict[str, SubtleFault] = {
     "LiDAR slips by 10 cm in the middle": lambda d: raised_lidar(d, 0.1),
     "LiDAR tilted by 1 deg in the middle": lambda d: knocked(d, 1.0),
     "scans stamped 50 ms early": lambda d: half_compensated(d, 0.05),
+    "pictures stretched by 2 % in height": lambda d: stretched(d, 1.02),
+    "lens askew, p1 = 0.004": lambda d: tangentially_distorted(d, 0.004),
+    "beams 2 % farther apart": lambda d: wider_beams(d, 1.02),
+    "azimuths eccentric by 0.2 deg": lambda d: eccentric_encoder(d, 0.2),
+    "labels of clouds 0.4 deg too wide": lambda d: bleeding_labels(d, 0.4, False),
+    "labels of clouds 0.4 deg too wide on one side": lambda d: bleeding_labels(d, 0.4, True),
+    "ranges with errors of 8 cm": lambda d: noisy_ranges(d, 0.08),
+    "masks 4 rows low": lambda d: lowered_masks(d, 4),
 }
 
 SUBTLE_NAMED: dict[str, str] = {

@@ -23,7 +23,19 @@ ASSUMPTIONS: dict[str, Assumption] = {
 }
 """All assumptions by name, in the order in which they are shown."""
 
-__all__ = ["ASSUMPTIONS", "Assumption", "Effect", "View", "combined", "held_at_zero", "named_sigmas"]
+OF_LIDAR: tuple[str, ...] = tuple(name for name, each in ASSUMPTIONS.items() if each.of_lidar)
+"""Names of those about the LiDAR; the others are about a camera or its clock."""
+
+__all__ = [
+    "ASSUMPTIONS",
+    "OF_LIDAR",
+    "Assumption",
+    "Effect",
+    "View",
+    "combined",
+    "held_at_zero",
+    "named_sigmas",
+]
 
 
 def named_sigmas(texts: Sequence[str]) -> tuple[tuple[str, float], ...]:

@@ -21,6 +21,7 @@ ELEVATION = Assumption(
     sigma=5e-4,
     source="a judgement, 0.03 deg; KISS-ICP corrects 0.2 deg in KITTI's HDL-64E",
     span=0.01,
+    of_lidar=True,
     violation="the LiDAR's beams are higher or lower than they should be (by how much they should be higher)",
     remedy="check the LiDAR's intrinsic calibration",
     prevalence=0.05,

@@ -25,6 +25,7 @@ RANGE_BIAS = Assumption(
     sigma=0.01,
     source="data sheets: accuracy of 2 cm at two sigma (HDL-64E)",
     span=0.5,
+    of_lidar=True,
     violation="the LiDAR's ranges are off by a constant (by how much they should be longer)",
     remedy="check the LiDAR's intrinsic calibration and the driver's range correction",
 )
@@ -35,6 +36,7 @@ RANGE_SCALE = Assumption(
     sigma=5e-4,
     source="data sheets: 2 cm at 40 m",
     span=0.1,
+    of_lidar=True,
     violation="the LiDAR's ranges are off by a scale (share by which they should be longer)",
     remedy="check the unit of the clouds and the LiDAR's range resolution",
 )

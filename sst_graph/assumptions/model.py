@@ -88,6 +88,7 @@ class Assumption:
         remedy: what to do about it.
         by_matches: whether the matches can test it. They cannot test the sweep: at constant speed it looks
             like a shift.
+        of_lidar: whether it is about the LiDAR: all cameras on it then have its error in common.
     """
 
     name: str
@@ -100,6 +101,7 @@ class Assumption:
     remedy: str
     prevalence: float = 0.02
     by_matches: bool = True
+    of_lidar: bool = False
 
     def figure(self, value: float, sigma: float) -> str:
         """The parameter's estimate with deviation and unit, as text."""

@@ -26,6 +26,7 @@ SWEEP = Assumption(
     sigma=0.03,
     source="compensation with the odometry of the vehicle: 3 % of its speed",
     span=1.0,
+    of_lidar=True,
     violation="the clouds are not compensated as assumed (share of a clockwise sweep that is left)",
     by_matches=False,
     remedy="say how the clouds were made with --sweep, or give the time of each point",

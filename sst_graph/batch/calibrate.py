@@ -96,16 +96,21 @@ def prepare_drives(
     prepare = preparation_of(config)
     with_lower_edges = config.method in ("joint", "both") and config.lower_edges != "never"
     depth = config.method in _NEED_DEPTH
-    classes = config.classes
+    classes = prepared_classes(config)
     if config.method == "edges":
-        sources, classes = [GeometricallyLabelled(source) for source in sources], (SemanticClass.OBJECT,)
-    elif config.method == "both":
-        classes = (*classes, SemanticClass.OBJECT)
+        sources = [GeometricallyLabelled(source) for source in sources]
     # One drive after the other, for the frames that the sweep is decided by are kept until they are read.
     return [
         prepare_drive(source, classes, prepare, progress, depth, with_lower_edges)
         for source in (with_sweep(source, config.decide_sweep) for source in sources)
     ]
+
+
+def prepared_classes(config: CalibrationConfig) -> tuple[SemanticClass, ...]:
+    """Classes that drives are prepared with: edges need objects of no class."""
+    if config.method == "edges":
+        return (SemanticClass.OBJECT,)
+    return (*config.classes, SemanticClass.OBJECT) if config.method == "both" else config.classes
 
 
 def preparation_of(config: CalibrationConfig) -> PrepareConfig:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.batch.config import CalibrationConfig
+from sst_graph.batch.shared_errors import SharedErrors
 from sst_graph.config import to_dict
 from sst_graph.covariance.observability import (
     MOTION,
@@ -79,6 +80,7 @@ class MethodEstimate:
         fit: how the estimate fits its data, of methods that measure it.
         by_sweeps: (7, 7) part of the covariance by sweeps that the scans leave undecided.
         sweep_reasons: those of the reasons that say that such sweeps matter.
+        shared: errors that other cameras on the LiDAR have, too, of methods without ``solved``.
     """
 
     cTl: gtsam.Pose3
@@ -95,6 +97,7 @@ class MethodEstimate:
     fit: Fit | None = None
     by_sweeps: FloatArray = field(default_factory=lambda: np.zeros((7, 7)))
     sweep_reasons: tuple[str, ...] = ()
+    shared: SharedErrors | None = None
 
 
 def result_of(

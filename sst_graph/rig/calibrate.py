@@ -11,10 +11,19 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.batch.calibrate import finished, preparation_of, prepare_drives, solve_problem
+from sst_graph.batch.by_edges.choice import with_method_for_cameras, with_method_of
+from sst_graph.batch.by_edges.method import edges_method
+from sst_graph.batch.calibrate import (
+    finished,
+    preparation_of,
+    prepare_drives,
+    prepared_classes,
+    solve_problem,
+)
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import Guess, MethodEstimate
 from sst_graph.batch.problem import CalibrationProblem
+from sst_graph.batch.shared_errors import SharedErrors
 from sst_graph.batch.sources import as_sources
 from sst_graph.config import to_dict
 from sst_graph.covariance.observability import open_directions
@@ -58,7 +67,7 @@ def calibrate_rig(
         cameras: by name, the drives of each camera: sources of the same scans (:func:`sst_graph.open_source`
             with another ``camera``), several in the same order. The LiDAR is read from those of the first.
         initial: rough guess of each cTl; a camera that is missing, or None, has none.
-        config: settings of all cameras; method auto is joint here.
+        config: settings of all cameras. Method auto is joint where all have labels, and edges otherwise.
         known: poses of cameras in one another, and a common trigger.
         initial_time_offsets_s: rough guess of each time offset; 0 for a camera that is missing [s].
         progress: called with (stage, steps done, steps in all).
@@ -67,8 +76,8 @@ def calibrate_rig(
         DataError: the frames cannot be used, or two cameras have different scans.
         ConfigError: the settings contradict each other or the data.
     """
-    config, known = _by_labels(config or CalibrationConfig()), known or KnownRig()
-    sources = {name: as_sources(own) for name, own in cameras.items()}
+    sources, known = {name: as_sources(own) for name, own in cameras.items()}, known or KnownRig()
+    config = with_method_for_cameras(config or CalibrationConfig(), list(sources.values()))
     _check(sources, config)
     known.check(list(sources))
     drives = prepare_rig(sources, config, progress)
@@ -81,12 +90,12 @@ def prepare_rig(
     sources: Mapping[str, Sequence[Source]], config: CalibrationConfig, progress: Progress | None = None
 ) -> dict[str, list[Drive]]:
     """The drives of each camera; scans, odometry and sweep are those of the first, prepared once."""
-    config = _by_labels(config)
+    config = with_method_for_cameras(config, list(sources.values()))
     (first, own), *others = sources.items()
     drives = {first: prepare_drives(own, config, progress)}
     for name, theirs in others:
         drives[name] = [
-            with_camera(drive, source, config.classes, preparation_of(config), progress)
+            with_camera(drive, source, prepared_classes(config), preparation_of(config), progress)
             for drive, source in zip(drives[first], theirs, strict=True)
         ]
     return drives
@@ -104,7 +113,7 @@ def calibrate_rig_prepared(
     Args:
         guesses: of every camera.
     """
-    config = _by_labels(config)
+    config = with_method_of(config, [drive for own in drives.values() for drive in own])
     # 1. Each camera by itself, on the same LiDAR features, odometry and object tracks.
     problems = _problems(drives, guesses, config, progress)
     cameras = {name: _solved(problem) for name, problem in problems.items()}
@@ -119,16 +128,11 @@ def calibrate_rig_prepared(
     return rig.result(after, config)
 
 
-def _by_labels(config: CalibrationConfig) -> CalibrationConfig:
-    """The settings with method joint for auto: only its estimates have their errors by name."""
-    return replace(config, method="joint") if config.method == "auto" else config
-
-
 def _check(sources: Mapping[str, Sequence[Source]], config: CalibrationConfig) -> None:
     if not sources:
         raise ConfigError("cameras: found none, expected one or more")
-    if config.method != "joint":
-        raise ConfigError(f"several cameras need method joint, found {config.method}")
+    if config.method not in ("joint", "edges"):
+        raise ConfigError(f"several cameras need method joint or edges, found {config.method}")
     if config.time_offset_per_drive:
         raise ConfigError("several cameras have one time offset each: leave out time_offset_per_drive")
     counts = {name: len(own) for name, own in sources.items()}
@@ -183,11 +187,16 @@ class _Camera:
         return None if outcome is None else CameraInfluences.of(outcome)
 
     @property
+    def shared(self) -> SharedErrors | None:
+        """Errors that other cameras have, too; None where it informs no other camera, or by labels."""
+        return self.estimate.shared if self.estimate is not None and self.trusted else None
+
+    @property
     def clusters(self) -> float:
-        """Effective number of sides of objects behind its covariance."""
+        """Effective number of sides of objects, or of half-samples of them, behind its covariance."""
         outcome = None if self.estimate is None else self.estimate.solved
         if outcome is None:
-            return 1.0
+            return 1.0 if self.shared is None else float(self.shared.estimated)
         table = outcome.estimate.robust.table
         weights = np.bincount(table.sides, table.root_weights**2)
         return float(weights.sum() ** 2 / max(float(weights @ weights), 1e-12))
@@ -205,12 +214,23 @@ def _solved(problem: CalibrationProblem, start: Guess | None = None) -> _Camera:
             problem.config.search, rotation_deg=_NEAR_DEG, translation_m=_NEAR_M, time_offset_s=_NEAR_S
         )
         own = replace(problem, guess=start, config=replace(problem.config, search=search))
-    result, estimate = finished(lambda: solve_problem(own), own.drives, own.guess, own.config)
+    result, estimate = finished(lambda: _estimate(own), own.drives, own.guess, own.config)
     if start is not None:
         config = {**result.config, "search": to_dict(problem.config.search)}
         guess = problem.guess
         result = replace(result, initial=guess.cTl, initial_time_offset_s=guess.time_offset_s, config=config)
     return _Camera(problem, result, estimate)
+
+
+def _estimate(problem: CalibrationProblem) -> MethodEstimate:
+    """A camera's estimate by the method of the settings.
+
+    Raises:
+        EstimationError: there is none.
+    """
+    if problem.config.method == "edges":
+        return edges_method(problem.drives, problem.guess, problem.config, problem.progress)
+    return solve_problem(problem)
 
 
 _NEAR_DEG, _NEAR_M, _NEAR_S = 1.0, 0.1, 0.05
@@ -229,8 +249,10 @@ class _Rig:
 
     @cached_property
     def joint(self) -> JointCovariance:
+        cameras = self.cameras.values()
         covariances = [self._covariance(name) for name in self.cameras]
-        return joint_covariance(covariances, [camera.influences for camera in self.cameras.values()])
+        influences = [camera.influences for camera in cameras]
+        return joint_covariance(covariances, influences, [camera.shared for camera in cameras])
 
     def _covariance(self, name: str) -> FloatArray:
         """(7, 7) of a camera's own estimate; wide where that is not to be trusted and others know better."""

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.association.edge_matching import SIDES
+from sst_graph.assumptions import OF_LIDAR
 from sst_graph.batch.problem import JointOutcome
 from sst_graph.covariance.cluster_robust import RobustCovariance, steps_without_objects
 from sst_graph.covariance.error_model import by_side_and_frame
@@ -33,9 +34,6 @@ UNKNOWNS = 7
 
 KINDS = ("side", "side_frame", "match")
 """Kinds of errors of the matches, as the error model has them."""
-
-LIDAR_ASSUMPTIONS = ("sweep", "range_bias", "range_scale", "elevation")
-"""Assumptions about the LiDAR, which all cameras share; the others are about a camera or its clock."""
 
 _MOST_SCANS, _MOST_CLASSES, _MOST_POINTS = 1_000_000, 256, 1_000_000
 
@@ -103,7 +101,7 @@ class CameraInfluences:
             root * motion,
             {
                 name: considered.sigmas[name] * considered.sensitivities[name][:UNKNOWNS]
-                for name in LIDAR_ASSUMPTIONS
+                for name in OF_LIDAR
                 if name in considered.sensitivities
             },
         )

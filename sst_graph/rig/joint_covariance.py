@@ -9,6 +9,9 @@ over the errors that both have. The motion, the objects of the jackknife and the
 same in both (rho = 1). The mask is each camera's own, so the errors of the matches are alike in part only:
 how far, the residuals show, by their correlation over the sides, and points, that both cameras see. The
 blocks of single cameras are their own covariances, unchanged.
+
+Estimates by edges have their errors as steps of half-samples of the objects
+(:class:`~sst_graph.batch.shared_errors.SharedErrors`), which are the same in all cameras.
 """
 
 from __future__ import annotations
@@ -20,6 +23,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.batch.shared_errors import SharedErrors
 from sst_graph.graph.linear import unit_scale
 from sst_graph.rig.influences import KINDS, UNKNOWNS, CameraInfluences, Influence
 
@@ -48,13 +52,17 @@ class JointCovariance:
 
 
 def joint_covariance(
-    covariances: Sequence[FloatArray], influences: Sequence[CameraInfluences | None]
+    covariances: Sequence[FloatArray],
+    influences: Sequence[CameraInfluences | None],
+    shared: Sequence[SharedErrors | None] = (),
 ) -> JointCovariance:
     """The joint covariance of cameras with covariances (7, 7) each.
 
     Args:
-        influences: of each camera; None for one without an estimate, which has nothing in common.
+        influences: of each camera; None for one without an estimate by labels.
+        shared: errors of each camera in their place; None for one without an estimate by edges.
     """
+    shared = shared or [None] * len(covariances)
     n = len(covariances)
     whole = np.zeros((UNKNOWNS * n, UNKNOWNS * n))
     known = [own for own in influences if own is not None]
@@ -66,6 +74,10 @@ def joint_covariance(
         one, other = influences[i], influences[j]
         if one is not None and other is not None:
             cross = _cross(one, other, correlations)
+            whole[blocks[i], blocks[j]], whole[blocks[j], blocks[i]] = cross, cross.T
+        mine, its = shared[i], shared[j]
+        if mine is not None and its is not None:
+            cross = mine.cross_covariance(its)
             whole[blocks[i], blocks[j]], whole[blocks[j], blocks[i]] = cross, cross.T
     sides = [own.matches["side"].names for own in known]
     seen = np.unique(np.concatenate([np.zeros(0, np.int64), *sides]), return_counts=True)[1]

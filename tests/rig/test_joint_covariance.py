@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sst_graph.batch.shared_errors import FEWEST, SharedErrors
 from sst_graph.rig.influences import KINDS, CameraInfluences, Influence
 from sst_graph.rig.joint_covariance import joint_covariance
 
@@ -72,6 +73,25 @@ def test_errors_that_are_alike_in_part() -> None:
 def test_other_objects_are_independent() -> None:
     matrix, _ = _joint(_camera(1), _camera(2, NAMES + 100))
     assert not matrix[:7, 7:].any()
+
+
+def test_half_samples_that_both_cameras_have() -> None:
+    """By edges: the same objects move both estimates, and so do the LiDAR's errors; without samples in common
+    only the latter are left."""
+    rng = np.random.default_rng(4)
+    steps, step = rng.standard_normal((16, 7)), np.arange(7.0)
+    one = SharedErrors(steps, {"elevation": step, "own": step})
+    other = SharedErrors(2.0 * steps, {"elevation": -step})
+    own, its = one.cross_covariance(one), other.cross_covariance(other)
+    objects = own - 2.0 * np.outer(step, step)
+    matrix = joint_covariance([own, its], [None, None], [one, other]).matrix
+    np.testing.assert_allclose(matrix[:7, 7:], 2.0 * objects - np.outer(step, step), rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose(np.diag(objects), np.var(steps, axis=0, ddof=1) * 15.0 / 7.0)
+    few = SharedErrors(np.where(np.arange(16)[:, None] < 17 - FEWEST, np.nan, steps), other.common)
+    assert few.estimated == FEWEST - 1
+    np.testing.assert_allclose(one.cross_covariance(few), -np.outer(step, step))
+    alone = joint_covariance([own, its], [None, None], [one, None]).matrix
+    assert not alone[:7, 7:].any()
 
 
 def test_residuals_of_opposite_sign_are_no_negative_correlation() -> None:

@@ -238,7 +238,7 @@ def test_a_start_beyond_the_search_is_found_by_the_other_camera() -> None:
 @pytest.mark.parametrize(
     ("overrides", "found"),
     [
-        (["method=motion"], "need method joint, found motion"),
+        (["method=motion"], "need method joint or edges, found motion"),
         (["time_offset_per_drive=true"], "one time offset"),
     ],
 )

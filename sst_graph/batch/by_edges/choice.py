@@ -34,6 +34,28 @@ def with_method_for(config: CalibrationConfig, sources: Sequence[Source]) -> Cal
     return replace(config, method=_method(looks, config))
 
 
+def with_method_for_cameras(
+    config: CalibrationConfig, cameras: Sequence[Sequence[Source]]
+) -> CalibrationConfig:
+    """The settings with one method for all cameras on a LiDAR, where the method is auto: by labels where
+    each of them has some, by edges otherwise.
+
+    Args:
+        cameras: drives of each; the scans of the first are those of all, and are read from there.
+
+    Raises:
+        DataError: a frame cannot be read.
+    """
+    if config.method != "auto":
+        return config
+    first, *others = cameras
+    looks = [_Looks.at(source) for source in first]
+    for own in others:
+        looks += [_Looks.at(source, of.scans) for source, of in zip(own, looks, strict=False)]
+    method = _method(looks, config)
+    return replace(config, method="edges" if method == "both" else method)
+
+
 def with_method_of(config: CalibrationConfig, drives: Sequence[Drive]) -> CalibrationConfig:
     """The same, by what drives were prepared for."""
     if config.method != "auto":
@@ -59,13 +81,16 @@ class _Looks:
     pictures: bool
 
     @classmethod
-    def at(cls, source: Source) -> _Looks:
+    def at(cls, source: Source, known_scans: tuple[frozenset[int], ...] | None = None) -> _Looks:
+        """Those of a source; ``known_scans`` are not read again."""
         places = evenly_spread(image_positions(source), _LOOKS)
         images = [image for k in places if (image := image_at(source, k)) is not None]
-        places = evenly_spread(scan_positions(source), _LOOKS)
-        scans = [scan for k in places if (scan := scan_at(source, k)) is not None]
+        if known_scans is None:
+            places = evenly_spread(scan_positions(source), _LOOKS)
+            scans = [scan for k in places if (scan := scan_at(source, k)) is not None]
+            known_scans = tuple(_classes(scan.classes) for scan in scans)
         return cls(
-            tuple(_classes(scan.classes) for scan in scans),
+            known_scans,
             tuple(_classes(image.mask) for image in images),
             any(image.has_picture for image in images),
         )

@@ -13,17 +13,19 @@ set-up, where edges lie between the beams, and upper edges that may be no outlin
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import hadamard
 
+from sst_graph.assumptions import OF_LIDAR
 from sst_graph.batch.by_edges.parts import thinned, with_objects, without_kind
 from sst_graph.batch.by_edges.positions import considered_positions
 from sst_graph.batch.problem import JointEstimate
-from sst_graph.covariance.considered import AssumptionConfig, considered_by_matches
+from sst_graph.batch.shared_errors import FEWEST, SharedErrors, spread_covariance
+from sst_graph.covariance.considered import AssumptionConfig, Considered, considered_by_matches
 from sst_graph.errors import EstimationError
 from sst_graph.features.lidar_edges import Edge
 from sst_graph.graph.outer_loop import JointProblem, solve_joint
@@ -49,8 +51,6 @@ _POINTS_A_SCAN = 500
 _STEP_SIGMAS = 0.5
 """A step shorter than this many standard deviations of the frozen problem ends a half-sample's outer loop:
 they are a tenth of its own."""
-FEWEST = 12
-"""Fewest half-samples that a spread is believed of."""
 FEW_OBJECTS = (
     "half of the objects has too few edges in view to calibrate with: how far the estimate may be off "
     "cannot be told; record a richer scene"
@@ -61,13 +61,30 @@ FEW_OUTLINES = (
 )
 
 
+@dataclass(frozen=True)
+class EdgesCovariance:
+    """The covariance of an estimate by edges.
+
+    Attributes:
+        matrix: (7, 7) of extrinsic and time offset.
+        sigmas: of its parts, JSON-able.
+        reasons: to doubt it.
+        shared: what of it the other cameras on this LiDAR have, too.
+    """
+
+    matrix: FloatArray
+    sigmas: Mapping[str, Any]
+    reasons: tuple[str, ...]
+    shared: SharedErrors
+
+
 def edges_covariance(
     problem: JointProblem,
     estimate: JointEstimate,
     objects: Sequence[Mapping[ObjectId, int]],
     assumptions: AssumptionConfig,
-) -> tuple[FloatArray, dict[str, Any], tuple[str, ...]]:
-    """(7, 7) covariance of extrinsic and time offset; sigmas of its parts, JSON-able; reasons to doubt it.
+) -> EdgesCovariance:
+    """The covariance of extrinsic and time offset.
 
     Args:
         problem: that was solved.
@@ -92,22 +109,24 @@ def edges_covariance(
     }
     total = np.asarray(sum(parts.values()), np.float64)
     sigmas = {name: np.sqrt(np.diag(part)).tolist() for name, part in parts.items()}
-    doubts = {FEW_OBJECTS: len(steps) < FEWEST, FEW_OUTLINES: outlines is None}
+    common = _deviations(considered, OF_LIDAR) | _deviations(positions, tuple(positions.sigmas))
+    # What no part of the model explains may be the LiDAR's.
+    common |= {f"floor_{axis}": step for axis, step in enumerate(np.diag(FLOOR)) if step.any()}
+    if outlines is not None:
+        common["shallow"] = outlines
+    shared = SharedErrors(steps, common)
+    doubts = {FEW_OBJECTS: shared.estimated < FEWEST, FEW_OUTLINES: outlines is None}
     reasons = tuple(reason for reason, holds in doubts.items() if holds)
-    return total, sigmas | {"samples": len(steps)}, reasons
+    return EdgesCovariance(total, sigmas | {"samples": shared.estimated}, reasons, shared)
 
 
-def spread_covariance(steps: FloatArray) -> FloatArray:
-    """(7, 7) covariance by the steps (k, 7) of half-samples; 0 of fewer than :data:`FEWEST`.
-
-    The inverse of a sample covariance is too large on average: by (k - 1) / (k - 2 - 7), of k samples in
-    seven dimensions (Hartlap, Simon and Schneider, Astronomy & Astrophysics 464, 2007). With that factor the
-    mean of the NEES is right.
-    """
-    k, size = len(steps), 7
-    if k < FEWEST:
-        return np.zeros((size, size))
-    return np.asarray(np.cov(steps.T) * (k - 1) / (k - 2 - size))
+def _deviations(considered: Considered, names: Sequence[str]) -> dict[str, FloatArray]:
+    """(7,) step by one deviation of each of these errors, by its name."""
+    return {
+        name: considered.sigmas[name] * considered.sensitivities[name][:7]
+        for name in names
+        if name in considered.sensitivities
+    }
 
 
 def half_samples() -> BoolArray:
@@ -120,17 +139,17 @@ def half_samples() -> BoolArray:
 def _half_sample_steps(
     problem: JointProblem, estimate: JointEstimate, objects: Sequence[Mapping[ObjectId, int]]
 ) -> FloatArray:
-    """(k, 7) steps from the estimate to those of the half-samples that have enough matches."""
-    start, steps = estimate.solution.state, []
+    """(SAMPLES, 7) steps from the estimate to those of the half-samples; NaN where matches are too few."""
+    start, steps = estimate.solution.state, np.full((SAMPLES, 7), np.nan)
     some = [thinned(drive, _POINTS_A_SCAN) for drive in problem.drives]
-    for kept in half_samples():
+    for number, kept in enumerate(half_samples()):
         drives = [with_objects(*each, kept) for each in zip(some, objects, strict=True)]
         try:
             part = solve_joint(replace(problem, drives=drives), start, NEAR_KERNELS_PX, None, _STEP_SIGMAS)
         except EstimationError:
             continue
-        steps.append(difference(start, part.state))
-    return np.array(steps).reshape(-1, 7)
+        steps[number] = difference(start, part.state)
+    return steps
 
 
 def _step_without_shallow(problem: JointProblem, start: State) -> FloatArray | None:

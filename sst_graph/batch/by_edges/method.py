@@ -148,10 +148,8 @@ def edges_method(
     estimate = JointEstimate.of(solution, calibration.objects)
     wider = solve_joint(problem.whole, solution.state, _WIDER_PX)
     drift = difference(solution.state, wider.state)
-    covariance, spread, unsure = edges_covariance(
-        problem.whole, estimate, calibration.objects, calibration.config.assumptions
-    )
-    covariance = covariance + np.outer(drift, drift)
+    own = edges_covariance(problem.whole, estimate, calibration.objects, calibration.config.assumptions)
+    covariance = own.matrix + np.outer(drift, drift)
     sweeps = sweep_effects(calibration, solution, covariance)
     covariance = covariance + sweeps.covariance
     # 5. Has it worked?
@@ -167,12 +165,13 @@ def edges_method(
         solution.state.time_offsets_s[0],
         covariance,
         frames_used(drives, solution),
-        (*reasons, *unsure, *sweeps.reasons),
+        (*reasons, *own.reasons, *sweeps.reasons),
         by_static_objects=covariance,
         diagnostics=_diagnostics(solution, contrast, motion)
-        | {"spread": spread | {"farther_edges": np.abs(drift).tolist()}},
+        | {"spread": {**own.sigmas, "farther_edges": np.abs(drift).tolist()}},
         by_sweeps=sweeps.covariance,
         sweep_reasons=sweeps.reasons,
+        shared=own.shared,
     )
 
 

@@ -10,14 +10,13 @@ from stored import simulated
 
 from sst_graph import CalibrationConfig, calibrate
 from sst_graph.association.edge_matching import TOP, MatchConfig, match_sigmas, sides_of
+from sst_graph.assumptions import OF_LIDAR
 from sst_graph.batch.by_edges.covariance import (
     FEW_OBJECTS,
     FEW_OUTLINES,
-    FEWEST,
     SAMPLES,
     edges_covariance,
     half_samples,
-    spread_covariance,
 )
 from sst_graph.batch.by_edges.parts import thinned, with_objects, without_kind
 from sst_graph.batch.by_edges.positions import position_columns
@@ -25,6 +24,7 @@ from sst_graph.batch.by_edges.reasons import MAX_DRIFT, drift_reasons
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.batch.method_estimate import Guess
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
+from sst_graph.batch.shared_errors import FEWEST, spread_covariance
 from sst_graph.drive.preparation import Drive
 from sst_graph.features.lidar_edges import Edge
 from sst_graph.graph.outer_loop import solve_joint
@@ -87,8 +87,9 @@ def test_the_covariance_has_the_spread_of_the_half_samples(drive: Drive) -> None
     joint = problem.joint()
     solution = solve_joint(joint, State(truth.cTl, (truth.time_offset_s,)), (3.0, 2.0))
     estimate = JointEstimate.of(solution, problem.objects)
-    covariance, parts, reasons = edges_covariance(joint, estimate, problem.objects, config.assumptions)
-    assert reasons == () and parts["samples"] >= FEWEST
+    found = edges_covariance(joint, estimate, problem.objects, config.assumptions)
+    covariance, parts = found.matrix, found.sigmas
+    assert found.reasons == () and parts["samples"] >= FEWEST
     names = ("matches", "objects", "assumptions", "positions", "shallow", "floor")
     np.testing.assert_allclose(np.diag(covariance), sum(np.square(parts[name]) for name in names))
     assert all((np.array(parts[name]) > 0.0).all() for name in names[:-1])
@@ -97,11 +98,16 @@ def test_the_covariance_has_the_spread_of_the_half_samples(drive: Drive) -> None
     assert pitch > 0.05 and yaw > 0.03 and roll < 0.5 * yaw
     # A poorer set-up is less sure.
     poorer = replace(config.assumptions, cy=3.0)
-    _, poor, _ = edges_covariance(joint, estimate, problem.objects, poorer)
+    poor = edges_covariance(joint, estimate, problem.objects, poorer).sigmas
     assert np.degrees(poor["assumptions"][1]) == pytest.approx(np.degrees(3.0 / drive.camera.fy), rel=0.1)
     starved = replace(joint, config=replace(joint.config, min_matches=10**6))
-    _, parts, reasons = edges_covariance(starved, estimate, problem.objects, config.assumptions)
-    assert parts["samples"] == 0 and reasons == (FEW_OBJECTS, FEW_OUTLINES)
+    few = edges_covariance(starved, estimate, problem.objects, config.assumptions)
+    assert few.sigmas["samples"] == 0 and few.reasons == (FEW_OBJECTS, FEW_OUTLINES)
+    # What another camera shares with this one are the objects, and the LiDAR's errors.
+    shared = parts["objects"], parts["positions"], parts["shallow"], parts["floor"]
+    of_lidar = [found.shared.common[name] for name in OF_LIDAR]
+    expected = sum(np.square(part) for part in (*shared, *of_lidar))
+    np.testing.assert_allclose(np.diag(found.shared.cross_covariance(found.shared)), expected)
 
 
 def test_upper_edges_that_may_be_no_outline_are_told_apart(drive: Drive) -> None:

@@ -1,0 +1,60 @@
+"""Errors that the estimates of several cameras on one LiDAR have in common, as steps of one of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+FEWEST = 12
+"""Fewest half-samples that a spread is believed of."""
+
+
+@dataclass(frozen=True)
+class SharedErrors:
+    """How an estimate of extrinsic and time offset moves by errors that other cameras have, too.
+
+    Attributes:
+        samples: (k, 7) steps to the estimates of half-samples of the objects, which are the same for all
+            cameras of a LiDAR; NaN where a half-sample has none [rad, m, s].
+        common: (7,) step by one deviation of each error of the LiDAR, by its name.
+    """
+
+    samples: FloatArray
+    common: Mapping[str, FloatArray]
+
+    @property
+    def estimated(self) -> int:
+        """Half-samples that have an estimate."""
+        return int(np.isfinite(self.samples).all(axis=1).sum())
+
+    def cross_covariance(self, other: SharedErrors) -> FloatArray:
+        """(7, 7) covariance with another camera's estimate."""
+        cross = spread_covariance(self.samples, other.samples)
+        for name in self.common.keys() & other.common.keys():
+            cross += np.outer(self.common[name], other.common[name])
+        return cross
+
+
+def spread_covariance(steps: FloatArray, others: FloatArray | None = None) -> FloatArray:
+    """(7, 7) covariance by the steps (k, 7) of half-samples; 0 of fewer than :data:`FEWEST`.
+
+    The inverse of a sample covariance is too large on average: by (k - 1) / (k - 2 - 7), of k samples in
+    seven dimensions (Hartlap, Simon and Schneider, Astronomy & Astrophysics 464, 2007). With that factor the
+    mean of the NEES is right.
+
+    Args:
+        others: (k, 7) steps of another camera's estimate by the same half-samples: the covariance of the two.
+    """
+    others = steps if others is None else others
+    known = np.isfinite(steps).all(axis=1) & np.isfinite(others).all(axis=1)
+    k, size = int(known.sum()), steps.shape[1]
+    if k < FEWEST:
+        return np.zeros((size, size))
+    a, b = steps[known], others[known]
+    cross = (a - a.mean(axis=0)).T @ (b - b.mean(axis=0)) / (k - 1)
+    return np.asarray(cross * (k - 1) / (k - 2 - size))
