@@ -103,7 +103,7 @@ def test_the_images_of_a_further_camera_are_read_and_not_its_scans() -> None:
     few = replace(STREET, frames=6)
     drive = simulate(few)
     further = Counting(with_mounts(drive, {"right": beside(drive, stereo_pose())}, "left")["right"])
-    found = prepare_rig({"left": [drive], "right": [further]}, CalibrationConfig())
+    found = prepare_rig({"left": [drive], "right": [further]}, CalibrationConfig(method="joint"))
     left, right = found["left"][0], found["right"][0]
     assert further.images == 6 and further.scans == 2  # the first and the last, for their stamps
     assert right.lidar_motions is left.lidar_motions
