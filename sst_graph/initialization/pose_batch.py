@@ -296,15 +296,14 @@ class PoseBatch:
         key = pairing.images[seen.pose, self._scans[seen.point]] * len(self.classes) + kinds
         # Small numbers are sorted many times faster.
         order = np.argsort(key.astype(np.int16) if key.max(initial=0) < 2**15 else key, kind="stable")
-        ordered = key[order]
-        starts = np.flatnonzero(np.diff(ordered, prepend=-1))
+        names, starts = np.unique(key[order], return_index=True)
         images, classes, count = self.edges.drive.images, self.classes, len(self.classes)
         contours, parts = [], [order[:0]]
-        for name, a, b in zip(ordered[starts].tolist(), starts, [*starts[1:], len(order)], strict=True):
+        for name, part in zip(names.tolist(), np.split(order, starts[1:]), strict=False):
             contour = self._fields.of(images[name // count], classes[name % count])
             if contour is not None:
                 contours.append(contour)
-                parts.append(order[a:b])
+                parts.append(part)
         if not contours:
             return order[:0], np.zeros(0), np.zeros((2, 0))
         some = np.concatenate(parts)
