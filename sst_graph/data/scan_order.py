@@ -44,11 +44,14 @@ def rings_from_order(points: NDArray[np.float32]) -> NDArray[np.uint16] | None:
     best, best_explained = None, MIN_EXPLAINED
     for seam in _SEAMS_RAD:
         start = _modulo_turn(np.float64(azimuth[0]) - seam)
-        rings = np.maximum((turned + start) // _TURN_RAD, 0.0).astype(np.int64)
-        explained = _explained(elevation, rings)
+        # The sum never falls: a ring ends where it reaches the next whole turn.
+        turns = np.arange(1, int((turned[-1] + start) // _TURN_RAD) + 1)
+        borders = np.searchsorted(turned + start, turns * _TURN_RAD)
+        counts = np.diff(borders, prepend=0, append=len(points))
+        explained = _explained(elevation, counts)
         if explained > best_explained:
-            best, best_explained = rings, explained
-    return None if best is None else best.astype(np.uint16)
+            best, best_explained = counts, explained
+    return None if best is None else np.repeat(np.arange(len(best), dtype=np.uint16), best)
 
 
 def _modulo_turn(angle: Any) -> Any:
@@ -56,12 +59,12 @@ def _modulo_turn(angle: Any) -> Any:
     return np.mod(angle + _BACK_STEP_RAD, _TURN_RAD) - _BACK_STEP_RAD
 
 
-def _explained(elevation: NDArray[np.float64], rings: NDArray[np.int64]) -> float:
-    """Share of the elevation's variance that lies between rings; 0 where there is no ring structure."""
-    number = int(rings[-1]) + 1
-    if not 2 <= number <= min(MAX_RINGS, len(rings) // MIN_POINTS_PER_RING):
+def _explained(elevation: NDArray[np.float64], counts: NDArray[np.intp]) -> float:
+    """Share of the elevation's variance that lies between rings, one after the other, of so many points each;
+    0 where there is no ring structure."""
+    if not 2 <= len(counts) <= min(MAX_RINGS, len(elevation) // MIN_POINTS_PER_RING):
         return 0.0
-    counts = np.maximum(np.bincount(rings), 1)
-    means = np.bincount(rings, elevation) / counts
+    rings = np.repeat(np.arange(len(counts)), counts)
+    means = np.bincount(rings, elevation, len(counts)) / np.maximum(counts, 1)
     total = float(np.var(elevation))
     return 1.0 - float(np.mean((elevation - means[rings]) ** 2)) / total if total > 0.0 else 0.0

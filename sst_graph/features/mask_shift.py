@@ -23,6 +23,9 @@ REACH_PX = 10
 SIDE = 2 * REACH_PX + 1
 _MARGIN_PX = REACH_PX + 2
 """Contour pixels this close to the image's border or to pixels to ignore are left out [px]."""
+_AROUND_PX = 16
+"""Pixels this far from an object have no part in what its contour shows: the longest shift and half the
+filters' widths [px]."""
 _LEAST_PIXELS = 60
 """Contour pixels of an object that takes part."""
 _MOST_PIXELS = 400
@@ -91,16 +94,21 @@ def contour_profiles(
 ) -> tuple[ContourProfile, ...]:
     """Profiles of the objects of a class in a mask (h, w) over its picture (h, w, 3)."""
     inside = (mask == int(semantic_class)).view(np.uint8)
+    # Only around the class: nothing else is looked at.
+    x, y, columns, rows = cv2.boundingRect(inside)
+    left, top = max(0, x - _AROUND_PX), max(0, y - _AROUND_PX)
+    part = slice(top, y + rows + _AROUND_PX), slice(left, x + columns + _AROUND_PX)
+    inside = np.ascontiguousarray(inside[part])
     outlines, _ = cv2.findContours(inside, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    gradients = _gradients(picture)
-    ignored = (mask == int(SemanticClass.IGNORE)).view(np.uint8)
+    gradients = _gradients(picture[part])
+    ignored = (mask[part] == int(SemanticClass.IGNORE)).view(np.uint8)
     unknown = cv2.dilate(ignored, np.ones((2 * _MARGIN_PX + 1,) * 2, np.uint8))
     normals_x, normals_y = _normals(inside)
-    found = []
+    (height, width), margin, found = mask.shape, _MARGIN_PX, []
     for outline in outlines:
         u, v = outline[:, 0].T.astype(np.intp)
-        height, width = mask.shape
-        usable = (u >= _MARGIN_PX) & (u < width - _MARGIN_PX) & (v >= _MARGIN_PX) & (v < height - _MARGIN_PX)
+        usable = (u + left >= margin) & (u + left < width - margin)
+        usable &= (v + top >= margin) & (v + top < height - margin)
         usable[usable] &= unknown[v[usable], u[usable]] == 0
         u, v = u[usable], v[usable]
         if len(u) < _LEAST_PIXELS:
@@ -111,7 +119,8 @@ def contour_profiles(
         spread = float(strength.std())
         if spread > 1e-3:
             scaled = ((strength - strength.mean()) / spread).astype(np.float32)
-            found.append(ContourProfile(scaled, float(np.sqrt(len(u))), int(u.mean() * _COLUMNS / width)))
+            cluster = int((u + left).mean() * _COLUMNS / width)
+            found.append(ContourProfile(scaled, float(np.sqrt(len(u))), cluster))
     return tuple(found)
 
 
@@ -175,8 +184,8 @@ def _strength(
     columns = (u[None, :] + steps[:, None])[None, :, :]
     # Both derivatives of all channels lie side by side: one look-up.
     found = gradients.reshape(-1, 6).take(rows * gradients.shape[1] + columns, axis=0)
-    along = found[..., :3] * nx[:, None] + found[..., 3:] * ny[:, None]
-    size = np.sqrt((along**2).sum(axis=-1))
+    # Channel by channel: sums over an axis of three are many times slower.
+    size = np.sqrt(sum((found[..., k] * nx + found[..., 3 + k] * ny) ** 2 for k in range(3)))
     return np.asarray(np.minimum(size, 4.0 * np.median(size) + 1e-6).mean(axis=-1), np.float64)
 
 

@@ -107,30 +107,28 @@ class _Pairing:
 
 @dataclass(frozen=True)
 class _InImage:
-    """Boundary points in an image, pose by pose.
+    """Boundary points in an image at its instant, pose by pose.
 
     Attributes:
         pose, point: (k,) which.
-        cPs, ways: (3, k) point, and the step to its neighbour outside the object, in the camera [m].
+        lPs, cPs: (3, k) points in the LiDAR frame and in the camera [m].
         uvs: (2, k) pixels.
-        rates: (3, k) of the points by the time offset, in the camera [m/s]; None where nothing moves.
     """
 
     pose: IntArray
     point: IntArray
+    lPs: FloatArray
     cPs: FloatArray
-    ways: FloatArray
     uvs: FloatArray
-    rates: FloatArray | None
 
     def take(self, index: IntArray) -> _InImage:
+        """Some of the points, by position."""
         return _InImage(
             self.pose[index],
             self.point[index],
-            self.cPs[:, index],
-            self.ways[:, index],
-            self.uvs[:, index],
-            None if self.rates is None else self.rates[:, index],
+            self.lPs.take(index, axis=1),
+            self.cPs.take(index, axis=1),
+            self.uvs.take(index, axis=1),
         )
 
 
@@ -183,26 +181,34 @@ class PoseBatch:
         config, owners = self.edges.config, self.edges.owners
         pairing = self._pairing(poses.offsets)
         seen = self._in_image(poses, pairing)
-        image = pairing.images[seen.pose, self._scans[seen.point]]
-        distance, normals = self._look_up(seen, image)
-        kind = self._classes[seen.point]
-        r = distance + poses.biases[seen.pose, kind]
-        # 1. Keep contours that face outward and are near, of objects of which enough points have one.
-        way, length = _directions(self.camera, seen)
-        cosine = way[0] * normals[0] + way[1] * normals[1]
-        matched = faces(cosine) & (np.abs(r) < GATE * kernel.scale)
         owner = seen.pose * (int(owners.max(initial=-1)) + 1) + owners[seen.point]
-        matched = of_matched_objects(matched, owner, np.bincount(owner, minlength=1), _MIN_OBJECT_SHARE)
+        # 1. Keep contours that are near and face outward, of objects of which enough points have one.
+        near, r, normals = self._near_contours(seen, poses, pairing, GATE * kernel.scale)
+        R = _by_row(poses.rotations)
+        close = seen.take(near)
+        turns = R.take(close.pose, axis=1)
+        way, length = _directions(
+            self.camera, close.cPs, _rotated(turns, self._ways.take(close.point, axis=1))
+        )
+        cosine = way[0] * normals[0] + way[1] * normals[1]
+        seen_owners = np.bincount(owner, minlength=1)
+        matched = of_matched_objects(faces(cosine), owner[near], seen_owners, _MIN_OBJECT_SHARE)
         on = np.flatnonzero(matched)
+        close, owner, r = close.take(on), owner[near[on]], r[on]
         # 2. Their weights.
         sigma = match_sigmas(length[on], cosine[on], config)
-        sides = sides_of(self.edges.points.edges[seen.point[on]], way[0, on])
-        robust = kernel.weight(r[on] / sigma)
-        weight = robust * side_weights(owner[on], sides, sigma, config) / sigma**2
+        sides = sides_of(self.edges.points.edges[close.point], way[0, on])
+        robust = kernel.weight(r / sigma)
+        weight = robust * side_weights(owner, sides, sigma, config) / sigma**2
         # 3. Normal equations.
-        rows = self._rows(seen.take(on), normals[:, on], kind[on], poses.biases.shape[1])
-        H, g = _normal_equations(rows, r[on], weight, seen.pose[on], len(poses))
-        support = np.bincount(seen.pose[on], robust, len(poses)).astype(np.float64)
+        rows = self._rows(close, normals[:, on], poses.biases.shape[1])
+        motion = self._motion(poses, pairing, close.pose, close.point)
+        if motion is not None:
+            last = motion[1] - motion[2]
+            rates = -(cross(last[:3], close.lPs) + last[3:])
+            rows[6] = (rows[3:6] * _rotated(turns[:, on], rates)).sum(axis=0)
+        H, g = _normal_equations(rows, r, weight, close.pose, len(poses))
+        support = np.bincount(close.pose, robust, len(poses)).astype(np.float64)
         in_image = np.bincount(seen.pose, minlength=len(poses)).astype(np.float64)
         return BatchEquations(H, g, support, in_image)
 
@@ -231,20 +237,14 @@ class PoseBatch:
         camera = self.camera
         # 1. Where nothing moved: most points are far from the image.
         pose, point = np.nonzero(self._roughly_in_view(poses, pairing))
-        # By row, for rows that lie together are worked on faster.
-        R = np.ascontiguousarray(poses.rotations.reshape(-1, 9).T)
-        t = np.ascontiguousarray(poses.translations.T)
-        lPs, rates = self._moved(poses, pairing, pose, point)
-        cPs = _rotated(R[:, pose], lPs) + t[:, pose]
+        lPs = self._moved(poses, pairing, pose, point)
+        cPs = _rotated(_by_row(poses.rotations).take(pose, axis=1), lPs)
+        cPs += _by_row(poses.translations).take(pose, axis=1)
         # 2. Where they are at the image's instant.
         ahead = np.maximum(cPs[2], _MIN_DEPTH_M)
         uvs = np.stack([camera.fx * cPs[0] / ahead + camera.cx, camera.fy * cPs[1] / ahead + camera.cy])
         inside = np.flatnonzero((cPs[2] > _MIN_DEPTH_M) & camera.in_image(uvs.T))
-        pose, point = pose[inside], point[inside]
-        turns = R[:, pose]
-        ways = _rotated(turns, self._ways[:, point])
-        rates = None if rates is None else _rotated(turns, rates[:, inside])
-        return _InImage(pose, point, cPs[:, inside], ways, uvs[:, inside], rates)
+        return _InImage(pose, point, lPs, cPs, uvs).take(inside)
 
     def _roughly_in_view(self, poses: Poses, pairing: _Pairing) -> NDArray[np.bool_]:
         """(m, n) whether a point that moves by less than :data:`_REACH_M` may fall into its image."""
@@ -257,65 +257,72 @@ class PoseBatch:
         near = (ahead > _MIN_DEPTH_M - margin) & (np.abs(across) <= side * (ahead + margin) + margin)
         return np.asarray(near & (pairing.images[:, self._scans] >= 0))
 
-    def _moved(
-        self, poses: Poses, pairing: _Pairing, pose: IntArray, point: IntArray
-    ) -> tuple[FloatArray, FloatArray | None]:
-        """Points (3, k) at their images' instant, and their rates by the time offset, in the LiDAR frame.
+    def _moved(self, poses: Poses, pairing: _Pairing, pose: IntArray, point: IntArray) -> FloatArray:
+        """Points (3, k) at their images' instant, in the LiDAR frame.
 
         lP' = Exp(-tau w) lP to second order, w the LiDAR's mean twist over the interval.
         """
-        lPs = self._lPs[:, point]
+        lPs, motion = self._lPs.take(point, axis=1), self._motion(poses, pairing, pose, point)
+        if motion is None:
+            return lPs
+        taus, now, change = motion
+        mean = now - 0.5 * change
+        step = taus * (cross(mean[:3], lPs) + mean[3:])
+        return np.asarray(lPs - step + 0.5 * taus * cross(mean[:3], step))
+
+    def _motion(
+        self, poses: Poses, pairing: _Pairing, pose: IntArray, point: IntArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """Intervals from points to their images' instants (k,) [s], the LiDAR's twists then (6, k) and by how
+        much they changed over the intervals (6, k) [rad/s, m/s]; None where nothing moves."""
         if pairing.twists is None or pairing.accelerations is None:
-            return lPs, None
+            return None
         scan = self._scans[point]
         taus = poses.offsets[pose] + pairing.base_taus_s[pose, scan] - self.edges.points.offsets_s[point]
         number = pose * pairing.images.shape[1] + scan
         now, change = (
-            np.ascontiguousarray(each.reshape(-1, 6).T)[:, number]
+            _by_row(each.reshape(-1, 6)).take(number, axis=1)
             for each in (pairing.twists, pairing.accelerations)
         )
         change *= taus
-        mean, last = now - 0.5 * change, now - change
-        step = taus * (cross(mean[:3], lPs) + mean[3:])
-        moved = lPs - step + 0.5 * taus * cross(mean[:3], step)
-        return moved, -(cross(last[:3], moved) + last[3:])
+        return taus, now, change
 
-    def _look_up(self, seen: _InImage, image: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Signed distances (k,) [px] and normals (2, k); infinite and 0 where there is no clear contour."""
-        distance, normals = np.full(len(image), np.inf), np.zeros((2, len(image)))
-        if len(image) == 0:
-            return distance, normals
-        key = image * len(self.classes) + self._classes[seen.point]
-        order = np.argsort(key, kind="stable")
+    def _near_contours(
+        self, seen: _InImage, poses: Poses, pairing: _Pairing, gate_px: float
+    ) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Positions (k,) of points with a clear contour nearby, residuals (k,) [px], normals (2, k)."""
+        kinds = self._classes[seen.point]
+        biases = poses.biases[seen.pose, kinds]
+        key = pairing.images[seen.pose, self._scans[seen.point]] * len(self.classes) + kinds
+        # Small numbers are sorted many times faster.
+        order = np.argsort(key.astype(np.int16) if key.max(initial=0) < 2**15 else key, kind="stable")
         names, starts = np.unique(key[order], return_index=True)
-        images, kinds = self.edges.drive.images, len(self.classes)
-        contours = [
-            self._fields.of(images[name // kinds], self.classes[name % kinds]) for name in names.tolist()
-        ]
-        ends = [*starts[1:].tolist(), len(order)]
-        spans = list(zip(starts.tolist(), ends, strict=True))
-        known = [
-            (contour, a, b) for contour, (a, b) in zip(contours, spans, strict=True) if contour is not None
-        ]
-        some = np.concatenate([order[:0], *(order[a:b] for _, a, b in known)])
-        if len(some):
-            counts = [b - a for _, a, b in known]
-            distance[some], normals[:, some] = _nearest_contours(
-                [contour for contour, _, _ in known], counts, seen.uvs[:, some]
-            )
-        return distance, normals
+        images, classes, count = self.edges.drive.images, self.classes, len(self.classes)
+        contours, parts = [], [order[:0]]
+        for name, part in zip(names.tolist(), np.split(order, starts[1:]), strict=False):
+            contour = self._fields.of(images[name // count], classes[name % count])
+            if contour is not None:
+                contours.append(contour)
+                parts.append(part)
+        if not contours:
+            return order[:0], np.zeros(0), np.zeros((2, 0))
+        some = np.concatenate(parts)
+        found, r, normals = _nearest_contours(
+            contours, list(map(len, parts[1:])), seen.uvs.take(some, axis=1), biases[some], gate_px
+        )
+        near = some[found]
+        order = np.argsort(near)
+        return near[order], r[order], normals[:, order]
 
-    def _rows(self, seen: _InImage, normals: FloatArray, kind: IntArray, classes: int) -> FloatArray:
-        """(7 + classes, k) derivatives of the residuals."""
+    def _rows(self, seen: _InImage, normals: FloatArray, classes: int) -> FloatArray:
+        """(7 + classes, k) derivatives of the residuals, by the time offset those of points at rest."""
         X, Y, Z = seen.cPs
         rows = np.zeros((7 + classes, len(X)))
         a, b = normals[0] * self.camera.fx / Z, normals[1] * self.camera.fy / Z
         c = -(a * X + b * Y) / Z
         rows[0], rows[1], rows[2] = Y * c - Z * b, Z * a - X * c, X * b - Y * a
         rows[3], rows[4], rows[5] = a, b, c
-        if seen.rates is not None:
-            rows[6] = (rows[3:6] * seen.rates).sum(axis=0)
-        rows[7 + kind, np.arange(len(X))] = 1.0
+        rows[7 + self._classes[seen.point], np.arange(len(X))] = 1.0
         return rows
 
 
@@ -324,10 +331,19 @@ def _rotated(R: FloatArray, x: FloatArray) -> FloatArray:
     return np.stack([R[i] * x[0] + R[i + 1] * x[1] + R[i + 2] * x[2] for i in (0, 3, 6)])
 
 
-def _directions(camera: PinholeCamera, seen: _InImage) -> tuple[FloatArray, FloatArray]:
-    """(2, k) unit outward directions of the objects in the image, and the lengths (k,) of the steps [px]."""
-    X, Y, Z = seen.cPs
-    dX, dY, dZ = seen.ways
+def _by_row(each: FloatArray) -> FloatArray:
+    """(k, m) numbers of m matrices or vectors: rows that lie together are worked on faster."""
+    return np.ascontiguousarray(each.reshape(len(each), -1).T)
+
+
+def _directions(camera: PinholeCamera, cPs: FloatArray, ways: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(2, k) unit outward directions of the objects in the image, and the lengths (k,) of the steps [px].
+
+    Args:
+        cPs, ways: (3, k) points, and the steps to their neighbours outside the objects, in the camera [m].
+    """
+    X, Y, Z = cPs
+    dX, dY, dZ = ways
     farther = np.maximum(Z + dZ, _MIN_DEPTH_M)
     step = np.stack([camera.fx * (dX - dZ * X / Z), camera.fy * (dY - dZ * Y / Z)]) / farther
     length = np.sqrt(step[0] ** 2 + step[1] ** 2)
@@ -335,39 +351,53 @@ def _directions(camera: PinholeCamera, seen: _InImage) -> tuple[FloatArray, Floa
 
 
 def _nearest_contours(
-    contours: Sequence[ContourMap], counts: Sequence[int], uvs: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Signed distances (k,) and normals (2, k) of contours at pixels (2, k) on their images; infinite at
-    ridges.
+    contours: Sequence[ContourMap],
+    counts: Sequence[int],
+    uvs: FloatArray,
+    biases: FloatArray,
+    gate_px: float,
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Contours near pixels (2, n) on their images: of which pixels (k,), residuals (k,) [px], normals (2, k).
 
     As :func:`~sst_graph.features.mask_contour.nearest_contours`, but distance and gradient are those of one
-    bilinear cell: four values are read for a pixel where central differences read twenty.
+    bilinear cell: four values are read for a pixel where central differences read twenty. Ridges are left
+    out.
 
     Args:
         counts: pixels of each contour, one contour's after the other's.
+        biases: (n,) that are added to the distances [px].
+        gate_px: a contour is near where its residual is smaller.
     """
-    boxes = [(c.left, c.top, *c.box, c.width, c.height) for c in contours]
-    left, top, columns, rows, width, height = np.repeat(boxes, counts, axis=0).T
+    borders = np.cumsum([0, *counts])
+    boxes = np.array([(c.left, c.top, *c.box, c.width, c.height) for c in contours]).T
+    left, top, columns, rows, width, height = np.repeat(boxes, counts, axis=1)
     u, v = uvs
     column, row = u.astype(np.intp), v.astype(np.intp)
     x0, y0 = column - left, row - top
     valid = well_inside(u, v, width, height) & (x0 >= 0) & (y0 >= 0) & (x0 < columns - 1) & (y0 < rows - 1)
-    at = np.where(valid, y0 * columns + x0, 0)
-    corners = at + np.stack([np.zeros_like(columns), np.ones_like(columns), columns, columns + 1])
+    inside = np.flatnonzero(valid)
+    x0, y0, columns = x0[inside], y0[inside], columns[inside]
+    at = y0 * columns + x0
+    corners = np.stack([at, at + 1, at + columns, at + columns + 1])
     values = np.empty(corners.shape, np.float32)
-    spans = list(itertools.pairwise(np.cumsum([0, *counts]).tolist()))
-    for contour, (start, end) in zip(contours, spans, strict=True):
-        values[:, start:end] = contour.distance.reshape(-1)[corners[:, start:end]]
+    for contour, (a, b) in zip(contours, itertools.pairwise(np.searchsorted(inside, borders)), strict=True):
+        values[:, a:b] = contour.distance.take(corners[:, a:b])
     a, b, c, d = values.astype(np.float64)
-    x, y = u - column, v - row
+    x, y = u[inside] - column[inside], v[inside] - row[inside]
     above, below = a + x * (b - a), c + x * (d - c)
     distance = above + y * (below - above)
+    r = distance + biases[inside]
+    # What follows is for the near ones only.
+    near = np.flatnonzero(np.abs(r) < gate_px)
+    inside = inside[near]
+    a, b, c, d, x, y, above, below = (each[near] for each in (a, b, c, d, x, y, above, below))
     gradient = np.stack([(1.0 - y) * (b - a) + y * (d - c), below - above])
     length = np.sqrt(gradient[0] ** 2 + gradient[1] ** 2)
-    valid &= length > MIN_GRADIENT
     normals = gradient / np.maximum(length, MIN_GRADIENT)
-    valid &= ~are_unknown(contours, spans, uvs - distance * normals - [left, top])
-    return np.where(valid, distance, np.inf), normals
+    feet = uvs.take(inside, axis=1) - distance[near] * normals - [left[inside], top[inside]]
+    spans = list(itertools.pairwise(np.searchsorted(inside, borders).tolist()))
+    clear = np.flatnonzero((length > MIN_GRADIENT) & ~are_unknown(contours, spans, feet))
+    return inside[clear], r[near[clear]], normals[:, clear]
 
 
 def _normal_equations(

@@ -3,19 +3,20 @@ have labels."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
 from sst_graph.batch.by_edges.label_parts import labelled_stamps
 from sst_graph.batch.config import CalibrationConfig, Method
-from sst_graph.data.frame_parts import image_at, image_positions, scan_at, scan_positions
+from sst_graph.data.frame_parts import RecentReader, image_positions, scan_positions
 from sst_graph.drive.preparation import Drive
 from sst_graph.sampling import evenly_spread
-from sst_graph.types import SemanticClass, Source
+from sst_graph.types import CameraImage, SemanticClass, Source
 
-_LOOKS = 8
+_MOST_SAMPLED = 8
 """Most scans and images of a drive that are looked at, spread over it."""
 
 
@@ -30,8 +31,8 @@ def with_method_for(config: CalibrationConfig, sources: Sequence[Source]) -> Cal
     """
     if config.method != "auto":
         return config
-    looks = [_Looks.at(source) for source in sources]
-    return replace(config, method=_method(looks, config))
+    sampled = [_SampledFrames(source) for source in sources]
+    return replace(config, method=_method(sampled, config))
 
 
 def with_method_for_cameras(
@@ -48,11 +49,13 @@ def with_method_for_cameras(
     """
     if config.method != "auto":
         return config
-    first, *others = cameras
-    looks = [_Looks.at(source) for source in first]
-    for own in others:
-        looks += [_Looks.at(source, of.scans) for source, of in zip(own, looks, strict=False)]
-    method = _method(looks, config)
+    first = cameras[0] if cameras else ()
+    sampled = [
+        _SampledFrames(source, scans_of)
+        for own in cameras
+        for source, scans_of in zip(own, first, strict=False)
+    ]
+    method = _method(sampled, config)
     return replace(config, method="edges" if method == "both" else method)
 
 
@@ -67,50 +70,49 @@ def with_method_of(config: CalibrationConfig, drives: Sequence[Drive]) -> Calibr
     return replace(config, method="both" if by_labels else "edges")
 
 
-@dataclass(frozen=True)
-class _Looks:
-    """What some frames of a drive hold.
+class _SampledFrames:
+    """What some frames of a drive hold. No more of them are read than an answer needs."""
 
-    Attributes:
-        scans, images: classes of each scan and image that was looked at; none without labels.
-        pictures: whether any image has a picture.
-    """
+    def __init__(self, source: Source, scans_of: Source | None = None) -> None:
+        """scans_of: the source that has the same scans, to be read from there; None: the source itself."""
+        self._drive = RecentReader(source)
+        self._scans_of = self._drive if scans_of is None or scans_of is source else RecentReader(scans_of)
 
-    scans: tuple[frozenset[int], ...]
-    images: tuple[frozenset[int], ...]
-    pictures: bool
-
-    @classmethod
-    def at(cls, source: Source, known_scans: tuple[frozenset[int], ...] | None = None) -> _Looks:
-        """Those of a source; ``known_scans`` are not read again."""
-        places = evenly_spread(image_positions(source), _LOOKS)
-        images = [image for k in places if (image := image_at(source, k)) is not None]
-        if known_scans is None:
-            places = evenly_spread(scan_positions(source), _LOOKS)
-            scans = [scan for k in places if (scan := scan_at(source, k)) is not None]
-            known_scans = tuple(_classes(scan.classes) for scan in scans)
-        return cls(
-            known_scans,
-            tuple(_classes(image.mask) for image in images),
-            any(image.has_picture for image in images),
-        )
-
-    @property
+    @cached_property
     def labelled(self) -> bool:
         """Whether both sensors have labels."""
-        return any(self.scans) and any(self.images)
+        return any(self._of_scans()) and any(self._of_images())
+
+    @cached_property
+    def pictures(self) -> bool:
+        """Whether any image has a picture."""
+        return any(image.has_picture for image in self._images())
 
     def on_both_sides(self, classes: frozenset[int]) -> bool:
         """Whether scans and images have labels of one of the classes."""
-        return bool(classes & frozenset().union(*self.scans) & frozenset().union(*self.images))
+        of_scans, of_images = frozenset().union(*self._of_scans()), frozenset().union(*self._of_images())
+        return bool(classes & of_scans & of_images)
+
+    def _of_scans(self) -> Iterator[frozenset[int]]:
+        """Classes of each scan that is looked at; none without labels."""
+        drive = self._scans_of
+        places = evenly_spread(scan_positions(drive.source), _MOST_SAMPLED)
+        return (_classes(scan.classes) for k in places if (scan := drive.scan(k)) is not None)
+
+    def _of_images(self) -> Iterator[frozenset[int]]:
+        return (_classes(image.mask) for image in self._images())
+
+    def _images(self) -> Iterator[CameraImage]:
+        places = evenly_spread(image_positions(self._drive.source), _MOST_SAMPLED)
+        return (image for k in places if (image := self._drive.image(k)) is not None)
 
 
-def _method(looks: Sequence[_Looks], config: CalibrationConfig) -> Method:
-    without = [each for each in looks if not each.labelled and each.pictures]
+def _method(sampled: Sequence[_SampledFrames], config: CalibrationConfig) -> Method:
+    without = [each for each in sampled if not each.labelled and each.pictures]
     classes = frozenset(map(int, config.classes))
     if not without:
         return "joint"
-    some_labels = any(each.on_both_sides(classes) for each in looks)
+    some_labels = any(each.on_both_sides(classes) for each in sampled)
     return "both" if some_labels and not config.time_offset_per_drive else "edges"
 
 
