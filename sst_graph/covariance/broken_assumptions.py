@@ -71,7 +71,7 @@ def _log_normal(value: float, variances: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=64)
 def _broken(evidence: Evidence) -> tuple[float, float]:
-    """:meth:`Evidence.broken`: a tracker asks for the same several times with each frame, between two tests."""
+    """:meth:`Evidence.broken`: between two tests a tracker asks for the same several times a frame."""
     return evidence.broken()
 
 
