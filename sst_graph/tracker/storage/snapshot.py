@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import cache
 from typing import Any
 
 _LISTS = (list, set, deque)
+_class_of: Callable[[object], Any] = type
 _PACKAGES = ("sst_graph.",)
 
 
@@ -23,13 +24,13 @@ class Snapshot:
     def __init__(self, root: object) -> None:
         self._saved: list[tuple[Any, Any]] = []
         seen: set[int] = set()
-        waiting = [value for value in (root,) if _is_followed(type(value))]
+        waiting: list[Any] = [root] if _is_followed(_class_of(root)) else []
         while waiting:
             value = waiting.pop()
             if id(value) in seen:
                 continue
             seen.add(id(value))
-            cls: Any = type(value)
+            cls = _class_of(value)
             inside: Iterable[Any]
             if cls is tuple:
                 inside = value
@@ -41,7 +42,7 @@ class Snapshot:
                 self._saved.append((held, dict(held)))
                 inside = held.values()
             # Most of what is held never changes in place: it is left out before it is looked at.
-            waiting += [one for one in inside if _is_followed(type(one))]
+            waiting += [one for one in inside if _is_followed(_class_of(one))]
 
     def __enter__(self) -> Snapshot:
         return self
