@@ -492,7 +492,9 @@ def _bias_of_each(alignments: Sequence[Alignment], biases_px: Any) -> list[int |
             )
         if isinstance(bias, GroupedBias) and (
             bias.groups.shape != (len(alignment),)
-            or not np.isin(bias.groups, np.arange(len(bias.biases))).all()
+            or bias.groups.dtype.kind not in "iu"
+            or bias.groups.min(initial=0) < 0
+            or bias.groups.max(initial=-1) >= len(bias.biases)
         ):
             raise FactorError(
                 "groups of a GroupedBias",

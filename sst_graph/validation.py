@@ -32,6 +32,8 @@ MOST_STRETCH = 1e6
 """No lens enlarges pixels more where an image is rectified."""
 
 _IS_CLASS = np.isin(np.arange(256), [int(c) for c in SemanticClass])
+_FIRST_UNKNOWN = int(np.argmin(_IS_CLASS))
+"""All smaller numbers are classes."""
 
 
 def checked_scan(scan: object, place: str = "scan", fewest: int = 1) -> Scan:
@@ -234,6 +236,9 @@ def _labels(array: NDArray[Any], place: str) -> NDArray[np.uint8]:
     if array.dtype != np.uint8 and (int(array.min()) < 0 or int(array.max()) > 255):
         raise DataError(place, f"labels {int(array.min())} to {int(array.max())}", "values of SemanticClass")
     labels = np.ascontiguousarray(array, np.uint8)
+    # Most arrays are known by their largest number.
+    if int(labels.max()) < _FIRST_UNKNOWN:
+        return labels
     known = _IS_CLASS.take(labels)
     if not known.all():
         raise DataError(place, f"label {int(labels[~known][0])}", "values of SemanticClass")

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,13 +69,19 @@ def _log_normal(value: float, variances: FloatArray) -> FloatArray:
     return np.asarray(-0.5 * (value**2 / variances + np.log(variances)))
 
 
+@lru_cache(maxsize=64)
+def _broken(evidence: Evidence) -> tuple[float, float]:
+    """:meth:`Evidence.broken`: between two tests a tracker asks for the same several times a frame."""
+    return evidence.broken()
+
+
 def considered_sigmas(evidence: Mapping[str, Evidence]) -> dict[str, float]:
     """Deviation of each assumption's parameter from zero, by name, that the estimate is to be covered for.
 
     Never below the prior one; that stays 0 where it is 0: the assumption holds exactly.
     """
     open_ = {name: each for name, each in evidence.items() if 0.0 < each.prior < each.span}
-    broken = {name: each.broken() for name, each in open_.items()}
+    broken = {name: _broken(each) for name, each in open_.items()}
     odds = {name: open_[name].prevalence * factor for name, (factor, _) in broken.items()}
     none = max(1.0 - sum(each.prevalence for each in open_.values()), 0.0)
     total = none + sum(odds.values())

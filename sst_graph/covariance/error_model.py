@@ -61,9 +61,11 @@ class SideResiduals:
     within: FloatArray
 
     @classmethod
-    def of(cls, r: FloatArray, weights: FloatArray, sides: IntArray, frames: IntArray) -> SideResiduals:
-        """From residuals, weights, sides and numbers of the frames, all (m,)."""
-        first, which = by_side_and_frame(sides, frames)
+    def of(
+        cls, r: FloatArray, weights: FloatArray, sides: IntArray, frames: IntArray | None = None
+    ) -> SideResiduals:
+        """From residuals, weights, sides and numbers of the frames (None: one frame), all (m,)."""
+        first, which = _by_side(sides) if frames is None else by_side_and_frame(sides, frames)
         total, squares, sums = (
             np.asarray(np.bincount(which, values, len(first)), np.float64)
             for values in (weights, weights**2, weights * r)
@@ -77,6 +79,12 @@ class SideResiduals:
         """Those of different frames."""
         names = ("sides", "means", "weights", "weights2", "within")
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+def _by_side(sides: IntArray) -> tuple[IntArray, IntArray]:
+    """:func:`by_side_and_frame` of one frame."""
+    _, first, which = np.unique(sides, return_index=True, return_inverse=True)
+    return first, which.reshape(-1)
 
 
 def by_side_and_frame(sides: IntArray, frames: IntArray) -> tuple[IntArray, IntArray]:

@@ -58,6 +58,8 @@ MAX_OUTER = 40
 """Most outer iterations: a bound on the time; what has not converged by then is reported."""
 MIN_MATCHES = 30
 """Fewest matches of a solution: single frames with few objects have more, and seven unknowns need them."""
+_PAIRS_A_UNIT = 6
+"""Pairs of scan and image whose outer iteration costs one unit of work (:mod:`sst_graph.stepwise`)."""
 MIN_CONCENTRATION = 0.6
 """Least :func:`concentration` of a result: wrong poses stay below it."""
 
@@ -179,7 +181,7 @@ def solve_joint_steps(
         iterations.append(OuterIteration(scale, count, state.cTl, state.time_offsets_s[0]))
         if progress is not None:
             progress("joint", outer + 1, config.max_outer)
-        yield pairs
+        yield 1 + pairs // _PAIRS_A_UNIT
         # 4. Stop when the step is small at the last scale.
         if at_last >= 0:
             step = frozen.step_sigmas(optimum, system)

@@ -269,9 +269,9 @@ class LidarOdometry:
         self._map = LocalMap(_MAP_VOXEL_M, _MAP_AGE) if self._mapped else None
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but the map; of the scans in it, points and poses."""
+        """All but the map and the last scan's parts; of the scans in the map, points and poses."""
         points = [(n, np.asarray(cloud.points())[:, :3], wTl) for n, cloud, wTl in self._mapped]
-        return {**vars(self), "_map": None, "_parted": None, "_mapped": points}
+        return {**vars(self), "_map": None, "_split": None, "_mapped": points}
 
     def __setstate__(self, state: Mapping[str, Any]) -> None:
         vars(self).update(state)

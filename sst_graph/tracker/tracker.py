@@ -208,18 +208,20 @@ class Tracker:
             saver.save(self)
 
     @staticmethod
-    def load(path: str | Path, setup: Setup | None = None) -> Tracker:
+    def load(path: str | Path, setup: Setup | None = None, sweep: SweepDecision | None = None) -> Tracker:
         """The tracker in a checkpoint, at the estimate it was saved with.
 
         Args:
             setup: camera, settings and guess that it must have been made with; None for any.
+            sweep: what was decided of the sweep of the scans to come, as for a new tracker; None: what the
+                checkpoint says.
 
         Raises:
             CheckpointError: no such file, not a checkpoint of this version, or one that was changed or
                 damaged.
             DataError: one of a tracker that was made with another camera, other settings or another guess.
         """
-        return load_checkpoint(path, setup)
+        return load_checkpoint(path, setup, sweep)
 
     # ------------------------------------------------------------------ steps
 

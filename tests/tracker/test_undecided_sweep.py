@@ -73,6 +73,10 @@ def test_tracker_and_batch_agree_about_it(tmp_path: Path) -> None:
     again = Tracker.load(path)
     assert again.estimate.sweep == decision
     assert again.result().reasons == result.reasons
+    # Unless another was made for the scans to come, as by the command that resumes it.
+    given = SweepDecision("given", TIMING)
+    told = Tracker.load(path, sweep=given)
+    assert told.estimate.sweep == given and told.result().reasons == ()
 
 
 def test_no_line_of_track_is_ok_where_the_sweep_is_open(

@@ -23,8 +23,8 @@ from sst_graph.files import output_file
 from sst_graph.odometry.sweep import SWEEP_KEY, SweptSource, with_sweep
 from sst_graph.result import CalibrationResult
 from sst_graph.tracker.config import TrackerConfig
-from sst_graph.tracker.storage.checkpoint import Saver
-from sst_graph.tracker.storage.resume import Setup, check_setup, frames_to_come
+from sst_graph.tracker.storage.checkpoint import Saver, checkpoint_setup
+from sst_graph.tracker.storage.resume import Setup, frames_to_come
 from sst_graph.tracker.track_update import TrackUpdate
 from sst_graph.tracker.tracker import Tracker
 from sst_graph.types import Frame, Source
@@ -166,16 +166,15 @@ def _begun(args: argparse.Namespace, source: Source) -> tuple[Tracker, SweptSour
         swept = with_sweep(source, config.calibration.decide_sweep)
         tracker = Tracker(source.camera, config, initial, time_offset_s, swept.sweep_decision)
         return tracker, swept, iter(swept)
-    tracker = Tracker.load(args.checkpoint)
-    made = tracker.setup
+    made = checkpoint_setup(args.checkpoint)
     initial, time_offset_s = made.initial, made.initial_time_offset_s
     if args.init is not None:
         initial, time_offset_s = starting_point(args.init, source, args.camera)
     # What is not asked for is the checkpoint's.
     asked = settings(made.config, args, flags)
-    check_setup(tracker, Setup(source.camera, asked, initial, time_offset_s), args.checkpoint)
+    setup = Setup(source.camera, asked, initial, time_offset_s)
     swept = with_sweep(source, made.config.calibration.decide_sweep)
-    tracker.estimate.sweep = swept.sweep_decision
+    tracker = Tracker.load(args.checkpoint, setup, swept.sweep_decision)
     return tracker, swept, frames_to_come(tracker, swept, args.checkpoint)
 
 

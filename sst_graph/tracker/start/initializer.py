@@ -33,8 +33,8 @@ NUMERICAL_ERRORS = (
 )
 """Errors that may come from the data; all others are errors of the program."""
 
-_WORK_PER_FRAME = 48
-"""Work on a start with each frame, in units of 1 to 4 ms: the estimate comes when all is done, some frames
+_WORK_PER_FRAME = 36
+"""Work on a start with each frame, in units of 4 ms: the estimate comes when all is done, some frames
 later, and no frame takes long for it. Work is counted, not timed, so that equal frames give equal results."""
 _RESTART_SCANS = 8
 """Scans that the start after an alarm is made of: fewer than a first one, for it begins near an estimate."""

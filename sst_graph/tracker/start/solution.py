@@ -46,6 +46,8 @@ _LEAST_PAIRS_SHARE = 0.7
 _LEAST_GAIN = 0.1
 """By which fraction of the cost a solution must be better than another one to be preferred to it, where their
 costs hardly differ: one whose offset was searched, or one of another basin."""
+_TRACKS_WORK, _COST_WORK = 12, 3
+"""To find the objects' motion, and the cost of a solution, in units of work."""
 _OFFSET_STEP_S = 0.005
 """Damping of the time offset in the first solution, as the prior deviation of a step [s]: a short stretch at
 one speed does not determine it."""
@@ -82,6 +84,23 @@ class _Solved:
         return _turn_rad(self.point.cTl, other.point.cTl) > _OTHER_BASIN_RAD
 
 
+@dataclass(frozen=True)
+class _Problem:
+    """What all solutions of a start share.
+
+    Attributes:
+        drive: the scans and images.
+        tracks: their twists, without objects.
+        joint: the joint method over them, its time offset damped.
+        config: settings.
+    """
+
+    drive: Drive
+    tracks: Tracks
+    joint: JointProblem
+    config: TrackerConfig
+
+
 class _NotConverged(EstimationError):
     """A solution that did not converge, and the point that it reached."""
 
@@ -103,14 +122,17 @@ def first_estimate_steps(drive: Drive, guess: Guess, config: TrackerConfig) -> S
     """
     searched = guess.search or guess.cTl is None
     reach = config.calibration.search.time_offset_s if guess.search else 0.0
+    tracks = Tracks([drive])
     # 1. Candidates, with time offsets around the guess's.
-    starts = yield from _starts(drive, guess, config, reach)
+    starts = yield from _starts(drive, tracks, guess, config, reach)
     # 2. Solutions from their poses with the guess's time offset, and from the candidates as they are.
     held = [State(start.cTl, (guess.time_offset_s,)) for start in _one_of_each_basin(starts)]
     # After a search the starts are near.
     kernels_px = NARROW_KERNELS_PX if searched else KERNELS_PX
     families = [held, starts] if reach > 0.0 else [starts]
-    solved, failed = yield from _all_of([_best(drive, each, kernels_px, config) for each in families])
+    problem = _Problem(drive, tracks, JointProblem.of([drive], _damped(config)), config)
+    yield _TRACKS_WORK
+    solved, failed = yield from _all_of([_best(problem, each, kernels_px) for each in families])
     if not solved:
         raise failed[-1]
     best, *others = solved
@@ -163,15 +185,13 @@ def _check_not_converged(best: _Solved, failed: Sequence[EstimationError]) -> No
             )
 
 
-def _best(
-    drive: Drive, starts: Sequence[State], kernels_px: Sequence[float], config: TrackerConfig
-) -> Stepwise[_Solved]:
+def _best(problem: _Problem, starts: Sequence[State], kernels_px: Sequence[float]) -> Stepwise[_Solved]:
     """The best of the solutions from some starts.
 
     Raises:
         EstimationError: no solution, or two that differ and explain the labels alike.
     """
-    solved, failed = yield from _all_of([_solution(drive, start, kernels_px, config) for start in starts])
+    solved, failed = yield from _all_of([_solution(problem, start, kernels_px) for start in starts])
     if not solved:
         if reached := _not_converged(failed):
             raise _NotConverged(str(failed[0]), min(reached, key=lambda one: one.cost))
@@ -186,7 +206,9 @@ def _best(
     return best
 
 
-def _starts(drive: Drive, guess: Guess, config: TrackerConfig, reach_s: float) -> Stepwise[list[State]]:
+def _starts(
+    drive: Drive, tracks: Tracks, guess: Guess, config: TrackerConfig, reach_s: float
+) -> Stepwise[list[State]]:
     """Where the solutions begin: the candidates that the batch's selection keeps, with offsets within
     ``reach_s`` of the guess's, or the guess itself.
 
@@ -197,7 +219,7 @@ def _starts(drive: Drive, guess: Guess, config: TrackerConfig, reach_s: float) -
     enabled = guess.search or guess.cTl is None
     search = dataclasses.replace(calibration.search, time_offset_s=reach_s, enabled=enabled)
     joint = _damped(config) if reach_s == 0.0 else calibration.joint
-    problem = StartProblem([drive], Tracks([drive]), calibration.classes, guess.cTl, guess.time_offset_s)
+    problem = StartProblem([drive], tracks, calibration.classes, guess.cTl, guess.time_offset_s)
     selection = yield from select_start_steps(problem, joint.graph, search)
     return [State(cTl, (time_offset_s,)) for cTl, time_offset_s in selection.starts]
 
@@ -209,13 +231,12 @@ def _damped(config: TrackerConfig) -> JointConfig:
     return dataclasses.replace(joint, graph=graph)
 
 
-def _solution(
-    drive: Drive, start: State, kernels_px: Sequence[float], config: TrackerConfig
-) -> Stepwise[_Solved]:
+def _solution(problem: _Problem, start: State, kernels_px: Sequence[float]) -> Stepwise[_Solved]:
     """The joint method from a start, its offset damped."""
+    drive, config = problem.drive, problem.config
     calibration = config.calibration
-    problem = JointProblem.of([drive], _damped(config))
-    solution = yield from solve_joint_steps(problem, start, kernels_px)
+    solution = yield from solve_joint_steps(problem.joint, start, kernels_px)
+    yield _COST_WORK
     state = solution.state
     biases = [state.biases_px.get((0, c), 0.0) for c in calibration.classes]
     names = tuple(name for name, _ in named_sigmas(calibration.noise.estimate))
@@ -224,19 +245,19 @@ def _solution(
     point = Point(cTl, time_offset_s, np.array(2 * biases), names=names, parameters=parameters)
     if not solution.converged:
         message = f"the first solution still moved after {solution.outer_iterations} iterations"
-        raise _NotConverged(message, _Solved(_cost(drive, point, config), point))
+        raise _NotConverged(message, _Solved(_cost(problem, point), point))
     if explained(solution) < MIN_EXPLAINED:
         share = f"{100.0 * explained(solution):.0f} %"
         raise EstimationError(f"only {share} of the boundary points in view meet a contour under it")
     _check_pairs(drive, start.time_offset_s(0), len(solution.pairs), state.time_offset_s(0), config)
-    return _Solved(_cost(drive, point, config), point)
+    return _Solved(_cost(problem, point), point)
 
 
-def _cost(drive: Drive, point: Point, config: TrackerConfig) -> float:
+def _cost(problem: _Problem, point: Point) -> float:
     """Mean cost of all boundary points of the window."""
-    joint, classes = config.calibration.joint, config.calibration.classes
+    joint, classes = problem.config.calibration.joint, problem.config.calibration.classes
     kernel = RobustKernel("geman_mcclure", KERNELS_PX[-1])
-    cost = held_out_cost(drive, Tracks([drive]), point, classes, kernel, joint.graph)
+    cost = held_out_cost(problem.drive, problem.tracks, point, classes, kernel, joint.graph)
     if cost is None:
         raise EstimationError("no boundary point meets an image")
     return cost

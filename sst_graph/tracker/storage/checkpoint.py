@@ -30,6 +30,7 @@ from sst_graph.files import atomic_write_in_steps
 from sst_graph.files.checked_values import checked_camera
 from sst_graph.files.object_store import Block, Blocks, Node, class_name, lay_out, restored, stored
 from sst_graph.files.reading import FileKind, parse_json, read_file
+from sst_graph.odometry.sweep import SweepDecision
 from sst_graph.tracker.make_update import current_update
 from sst_graph.tracker.storage.resume import Setup, check_inputs, check_setup
 from sst_graph.types import NO_PICTURE, CameraImage
@@ -232,17 +233,57 @@ def _portions(parts: Sequence[bytes]) -> Iterator[list[bytes]]:
     yield portion
 
 
-def load_checkpoint(path: str | Path, setup: Setup | None = None) -> Tracker:
+def load_checkpoint(
+    path: str | Path, setup: Setup | None = None, sweep: SweepDecision | None = None
+) -> Tracker:
     """The tracker in a checkpoint, at the estimate it was saved with.
 
     :func:`sst_graph.tracker.storage.resume.frames_to_come` checks that it goes on with its own drive.
 
     Args:
         setup: camera, settings and guess that it must have been made with; None for any.
+        sweep: what was decided of the sweep of the scans to come; None: what the checkpoint says.
 
     Raises:
         CheckpointError: no such file, not a checkpoint of this version, or one that was changed or damaged.
         DataError: one of a tracker that was made with another camera, other settings or another guess.
+    """
+    document, data = _read(path)
+    # Numbers of a forged file overflow where those of a tracker do not: no warning of NumPy's is ours.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        _check_tracker(_tracker(document, data, path), path)
+        tracker = _tracker(document, data, path)
+        tracker.initializer.catch_up()
+    if setup is not None:
+        check_setup(tracker, setup, path)
+    if sweep is not None:
+        tracker.estimate.sweep = sweep
+    return tracker
+
+
+def checkpoint_setup(path: str | Path) -> Setup:
+    """Camera, settings and guess of the tracker in a checkpoint, which is not checked beyond that.
+
+    Raises:
+        CheckpointError: as :func:`load_checkpoint`.
+    """
+    document, data = _read(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        setup = getattr(_tracker(document, data, path), "setup", None)
+    if not isinstance(setup, Setup):
+        raise CheckpointError(
+            path, f"a checkpoint with a setup of {type(setup).__name__}", "all of a tracker"
+        )
+    return setup
+
+
+def _read(path: str | Path) -> tuple[dict[str, Any], memoryview]:
+    """Document and bytes of a checkpoint of this version.
+
+    Raises:
+        CheckpointError: no such file, or another one.
     """
     try:
         head, data = _members(read_file(path, CHECKPOINT), path)
@@ -256,15 +297,8 @@ def load_checkpoint(path: str | Path, setup: Setup | None = None) -> Tracker:
         raise CheckpointError(
             path, f"{found[0]!r:.60} version {found[1]!r:.60}", f"{FORMAT} version {VERSION}"
         )
-    # Numbers of a forged file overflow where those of a tracker do not: no warning of NumPy's is ours.
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        _check_tracker(_tracker(document, data, path), path)
-        tracker = _tracker(document, data, path)
-        tracker.initializer.catch_up()
-    if setup is not None:
-        check_setup(tracker, setup, path)
-    return tracker
+    assert isinstance(document, dict)
+    return document, data
 
 
 def _tracker(document: dict[str, Any], data: memoryview, path: str | Path) -> Tracker:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable, Iterable
 from functools import cache
 from typing import Any
 
-_CONTAINERS = (dict, list, set, deque)
+_LISTS = (list, set, deque)
+_class_of: Callable[[object], Any] = type
 _PACKAGES = ("sst_graph.",)
 
 
@@ -22,25 +24,25 @@ class Snapshot:
     def __init__(self, root: object) -> None:
         self._saved: list[tuple[Any, Any]] = []
         seen: set[int] = set()
-        waiting: list[Any] = [root]
+        waiting: list[Any] = [root] if _is_followed(_class_of(root)) else []
         while waiting:
             value = waiting.pop()
-            cls: Any = type(value)
-            if id(value) in seen or not _is_followed(cls):
+            if id(value) in seen:
                 continue
             seen.add(id(value))
-            if isinstance(value, tuple):
-                waiting.extend(value)
-            elif isinstance(value, dict):
-                self._saved.append((value, dict(value)))
-                waiting.extend(value.values())
-            elif isinstance(value, list | set | deque):
-                self._saved.append((value, tuple(value)))
-                waiting.extend(value)
+            cls = _class_of(value)
+            inside: Iterable[Any]
+            if cls is tuple:
+                inside = value
+            elif cls in _LISTS:
+                inside = tuple(value)
+                self._saved.append((value, inside))
             else:
-                attributes = vars(value)
-                self._saved.append((attributes, dict(attributes)))
-                waiting.extend(attributes.values())
+                held = value if cls is dict else vars(value)
+                self._saved.append((held, dict(held)))
+                inside = held.values()
+            # Most of what is held never changes in place: it is left out before it is looked at.
+            waiting += [one for one in inside if _is_followed(_class_of(one))]
 
     def __enter__(self) -> Snapshot:
         return self
@@ -62,7 +64,7 @@ class Snapshot:
 @cache
 def _is_followed(cls: Any) -> bool:
     """Whether instances of a class change in place, or hold others that do."""
-    if cls in _CONTAINERS or cls is tuple:
+    if cls in _LISTS or cls is dict or cls is tuple:
         return True
     if not f"{cls.__module__}.".startswith(_PACKAGES) or issubclass(cls, tuple | int | str):
         return False

@@ -130,12 +130,12 @@ def linearize_pair(
     J = J - JV @ gain  # sensitivity of the estimate to a residual, the twist at its optimum
     track = np.concatenate([columns.tracks_of(pair, c) for c in pair.matches])
     side = track * SIDES + np.concatenate([m.sides for m in pair.matches.values()])
-    own, frame = roots / np.sqrt(share), np.zeros(len(r), np.intp)
+    own = roots / np.sqrt(share)
     return LinearizedPair(
         information,
         observed,
         _with_share(ScoreSums.of_frame(J, roots, side), share),
-        SideResiduals.of(unweighted(r, roots), own**2, side, frame),
+        SideResiduals.of(unweighted(r, roots), own**2, side),
         len(pair),
         places,
         ObjectInformation.of(J[:, :n], r, roots, track, point) if by_object else None,
