@@ -138,20 +138,26 @@ def profiles(
         spans: where the pixels of each picture begin and end, one after the other.
         outward: (n, 2) unit vectors.
     """
-    found = np.zeros((len(ts), len(uvs)), np.float32)
+    found, usual = np.zeros((len(ts), len(uvs)), np.float32), np.zeros(len(uvs), np.float32)
     number = direction_numbers(outward)
+    # 1. Where to look, for all pictures at once.
+    width, height = np.ones((2, len(uvs)), np.intp)
     for each, (a, b) in zip(gradients, spans, strict=True):
-        if b <= a:
-            continue
-        u = uvs[a:b, 0] + ts[:, None] * outward[a:b, 0]
-        v = uvs[a:b, 1] + ts[:, None] * outward[a:b, 1]
-        u, v = np.clip(u, 0.0, each.width - 1.0), np.clip(v, 0.0, each.height - 1.0)
-        strength = sampled(each.strengths, u, v + number[a:b] * each.height)
-        quarter = -(-each.height // 4)
-        column, row = (uvs[a:b, 0] / 4.0).astype(np.intp), (uvs[a:b, 1] / 4.0).astype(np.intp)
-        column, row = np.clip(column, 0, -(-each.width // 4) - 1), np.clip(row, 0, quarter - 1)
-        usual = each.usual[row + number[a:b] * quarter, column]
-        found[:, a:b] = (strength.astype(np.float32) - usual) / np.float32(UNIT)
+        width[a:b], height[a:b] = each.width, each.height
+    u = np.clip(uvs[:, 0] + ts[:, None] * outward[:, 0], 0.0, width - 1.0)
+    v = np.clip(uvs[:, 1] + ts[:, None] * outward[:, 1], 0.0, height - 1.0)
+    u, v = u.astype(np.float32), (v + number * height).astype(np.float32)
+    column, row = (uvs / 4.0).astype(np.intp).T
+    quarter = -(-height // 4)
+    column, row = np.clip(column, 0, -(-width // 4) - 1), np.clip(row, 0, quarter - 1)
+    row = row + number * quarter
+    # 2. Look.
+    for each, (a, b) in zip(gradients, spans, strict=True):
+        if b > a:
+            found[:, a:b] = sampled(each.strengths, u[:, a:b], v[:, a:b])
+            usual[a:b] = each.usual[row[a:b], column[a:b]]
+    found -= usual
+    found /= np.float32(UNIT)
     return found
 
 
