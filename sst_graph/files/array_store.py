@@ -101,9 +101,7 @@ class ArrayStore:
         return flat.reshape(shape)
 
 
-def _mapped(
-    descriptor: int, start: int, dtype: np.dtype[Any], shape: tuple[int, ...]
-) -> NDArray[Any] | None:
+def _mapped(descriptor: int, start: int, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any] | None:
     """A large array of a file, of which only what is looked at is read; None of a small one, or where the
     file cannot be mapped."""
     count = math.prod(shape)

@@ -15,7 +15,7 @@ from sst_graph.drive.preparation import Drive
 from sst_graph.sampling import evenly_spread
 from sst_graph.types import SemanticClass, Source
 
-_LOOKS = 8
+_MOST_SAMPLED = 8
 """Most scans and images of a drive that are looked at, spread over it."""
 
 
@@ -30,8 +30,8 @@ def with_method_for(config: CalibrationConfig, sources: Sequence[Source]) -> Cal
     """
     if config.method != "auto":
         return config
-    looks = [_Looks.at(source) for source in sources]
-    return replace(config, method=_method(looks, config))
+    sampled = [_SampledFrames.of(source) for source in sources]
+    return replace(config, method=_method(sampled, config))
 
 
 def with_method_of(config: CalibrationConfig, drives: Sequence[Drive]) -> CalibrationConfig:
@@ -46,7 +46,7 @@ def with_method_of(config: CalibrationConfig, drives: Sequence[Drive]) -> Calibr
 
 
 @dataclass(frozen=True)
-class _Looks:
+class _SampledFrames:
     """What some frames of a drive hold.
 
     Attributes:
@@ -59,10 +59,10 @@ class _Looks:
     pictures: bool
 
     @classmethod
-    def at(cls, source: Source) -> _Looks:
-        places = evenly_spread(image_positions(source), _LOOKS)
+    def of(cls, source: Source) -> _SampledFrames:
+        places = evenly_spread(image_positions(source), _MOST_SAMPLED)
         images = [image for k in places if (image := image_at(source, k)) is not None]
-        places = evenly_spread(scan_positions(source), _LOOKS)
+        places = evenly_spread(scan_positions(source), _MOST_SAMPLED)
         scans = [scan for k in places if (scan := scan_at(source, k)) is not None]
         return cls(
             tuple(_classes(scan.classes) for scan in scans),
@@ -80,12 +80,12 @@ class _Looks:
         return bool(classes & frozenset().union(*self.scans) & frozenset().union(*self.images))
 
 
-def _method(looks: Sequence[_Looks], config: CalibrationConfig) -> Method:
-    without = [each for each in looks if not each.labelled and each.pictures]
+def _method(sampled: Sequence[_SampledFrames], config: CalibrationConfig) -> Method:
+    without = [each for each in sampled if not each.labelled and each.pictures]
     classes = frozenset(map(int, config.classes))
     if not without:
         return "joint"
-    some_labels = any(each.on_both_sides(classes) for each in looks)
+    some_labels = any(each.on_both_sides(classes) for each in sampled)
     return "both" if some_labels and not config.time_offset_per_drive else "edges"
 
 

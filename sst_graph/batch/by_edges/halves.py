@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.batch.by_edges.covariance import SAMPLES
+from sst_graph.batch.by_edges.covariance import NEAR_KERNELS_PX, SAMPLES
 from sst_graph.batch.by_edges.reasons import MIN_OVER_OTHER
 from sst_graph.batch.contradictions import FALSE_ALARM
 from sst_graph.covariance.contradiction import Difference, PartEstimate, name_step
@@ -94,7 +94,7 @@ def _half(
     # 2. The best of them on all.
     best = max(found, key=lambda one: one[0])[1]
     try:
-        best = solve_joint(replace(problem, drives=[drive], tracks=tracks), best, KERNELS_PX).state
+        best = solve_joint(replace(problem, drives=[drive], tracks=tracks), best, NEAR_KERNELS_PX).state
     except EstimationError:
         return None
     return PartEstimate(difference(state, best), 2.0 * covariance, float(SAMPLES))
