@@ -353,6 +353,7 @@ def match_edges(
     index = np.flatnonzero(paired.camera.in_image(uvs))
     some, uvs = paired.take(index), uvs[index]
     seen, objects_seen = np.diff(some.bounds), np.bincount(some.owners)
+    tips: FloatArray | None = None
     # 2. Find the nearest contours within the gate.
     if any(isinstance(contour, PictureGradients) for contour in paired.contours):
         tips = some.projected(some.points.outward, cTl, time_offset_s, poses)
@@ -368,7 +369,7 @@ def match_edges(
     index, uvs, normals, pixels = index[near], uvs[near], feet.normals[near], feet.feet[near]
     some = paired.take(index)
     # 3. Keep contours that face the outward direction of the object.
-    tips = some.projected(some.points.outward, cTl, time_offset_s, poses)
+    tips = some.projected(some.points.outward, cTl, time_offset_s, poses) if tips is None else tips[near]
     if shift is not None and deviation is not None:
         shift = shift[index]
         tips = tips + _pixel_shift(deviation.take(index), some, tips)
@@ -425,7 +426,7 @@ def _contours_or_gradients(
     normals, feet = np.tile([1.0, 0.0], (n, 1)), uvs.copy()
     masked, unmasked = np.flatnonzero(~by_gradient), np.flatnonzero(by_gradient)
     for index in (masked, unmasked):
-        some = paired.take(index)
+        some = paired.take(index) if len(index) < n else paired
         groups = [
             (each, span) for each, span in zip(some.contours, some.spans, strict=True) if span[1] > span[0]
         ]

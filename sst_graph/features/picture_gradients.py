@@ -96,13 +96,16 @@ class PictureGradients:
     def blurred(self, sigma_px: float, every: int) -> FloatMap:
         """(DIRECTIONS, h / every, w / every) strengths above the usual, blurred, of every so many pixels;
         both sizes rounded up."""
-        size = -(-self.width // every), -(-self.height // every)
-        parts = np.split(self.strengths, DIRECTIONS)
-        usual = np.split(self.usual, DIRECTIONS)
+        width, height = -(-self.width // every), -(-self.height // every)
+        # A whole number of pixels in each: they are where they belong, and counted ten times as fast.
+        border = (0, height * every - self.height, 0, width * every - self.width)
         fields = []
-        for strength, mean in zip(parts, usual, strict=True):
-            small = cv2.resize(strength, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-            small -= cv2.resize(mean, size, interpolation=cv2.INTER_LINEAR)
+        for strength, mean in zip(
+            np.split(self.strengths, DIRECTIONS), np.split(self.usual, DIRECTIONS), strict=True
+        ):
+            whole = cv2.copyMakeBorder(strength, *border, cv2.BORDER_REPLICATE)
+            small = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
+            small -= cv2.resize(mean, (width, height), interpolation=cv2.INTER_LINEAR)
             fields.append(cv2.GaussianBlur(small, (0, 0), sigma_px / every) / np.float32(UNIT))
         return np.stack(fields)
 
@@ -138,20 +141,30 @@ def profiles(
         spans: where the pixels of each picture begin and end, one after the other.
         outward: (n, 2) unit vectors.
     """
-    found = np.zeros((len(ts), len(uvs)), np.float32)
+    found, usual = np.zeros((len(ts), len(uvs)), np.float32), np.zeros(len(uvs), np.float32)
     number = direction_numbers(outward)
+    # 1. Where to look, for all pictures at once.
+    width, height = np.ones((2, len(uvs)), np.intp)
     for each, (a, b) in zip(gradients, spans, strict=True):
-        if b <= a:
-            continue
-        u = uvs[a:b, 0] + ts[:, None] * outward[a:b, 0]
-        v = uvs[a:b, 1] + ts[:, None] * outward[a:b, 1]
-        u, v = np.clip(u, 0.0, each.width - 1.0), np.clip(v, 0.0, each.height - 1.0)
-        strength = sampled(each.strengths, u, v + number[a:b] * each.height)
-        quarter = -(-each.height // 4)
-        column, row = (uvs[a:b, 0] / 4.0).astype(np.intp), (uvs[a:b, 1] / 4.0).astype(np.intp)
-        column, row = np.clip(column, 0, -(-each.width // 4) - 1), np.clip(row, 0, quarter - 1)
-        usual = each.usual[row + number[a:b] * quarter, column]
-        found[:, a:b] = (strength.astype(np.float32) - usual) / np.float32(UNIT)
+        width[a:b], height[a:b] = each.width, each.height
+    u, v = ts[:, None] * outward[:, 0], ts[:, None] * outward[:, 1]
+    u += uvs[:, 0]
+    v += uvs[:, 1]
+    np.clip(u, 0.0, width - 1.0, out=u)
+    np.clip(v, 0.0, height - 1.0, out=v)
+    v += number * height
+    u, v = u.astype(np.float32), v.astype(np.float32)
+    column, row = (uvs / 4.0).astype(np.intp).T
+    quarter = -(-height // 4)
+    column, row = np.clip(column, 0, -(-width // 4) - 1), np.clip(row, 0, quarter - 1)
+    row = row + number * quarter
+    # 2. Look.
+    for each, (a, b) in zip(gradients, spans, strict=True):
+        if b > a:
+            found[:, a:b] = sampled(each.strengths, u[:, a:b], v[:, a:b])
+            usual[a:b] = each.usual[row[a:b], column[a:b]]
+    found -= usual
+    found /= np.float32(UNIT)
     return found
 
 
@@ -194,14 +207,14 @@ def nearest_edges(
     width, height = np.repeat(np.array(sizes).reshape(-1, 2), [b - a for a, b in spans], axis=0).T
     valid = well_inside(uvs[:, 0], uvs[:, 1], width, height)
     safe = np.where(valid[:, None], uvs, 5.0)
-    strength = profiles(gradients, spans, safe, outward, ts).astype(np.float64)
-    mass = np.maximum(strength, 0.0) * np.exp(-0.5 * (ts / scale_px) ** 2)[:, None]
-    total = mass.sum(axis=0)
-    centre = (ts @ mass) / np.maximum(total, 1e-9)
+    mass = np.maximum(profiles(gradients, spans, safe, outward, ts), 0.0, dtype=np.float64)
+    mass *= np.exp(-0.5 * (ts / scale_px) ** 2)[:, None]
+    total, first, second = np.stack([np.ones_like(ts), ts, ts**2]) @ mass
+    centre = first / np.maximum(total, 1e-9)
     valid &= total * step > _LEAST_MASS
     shares = np.minimum(total * step / (_MOST * 2.0), 1.0)
     if peaks:
-        variance = (ts**2 @ mass) / np.maximum(total, 1e-9) - centre**2
+        variance = second / np.maximum(total, 1e-9) - centre**2
         stiffness = 1.0 - variance / scale_px**2
         centre = centre / np.maximum(stiffness, _LEAST_STIFFNESS)
         shares = shares * np.maximum(stiffness, 0.0)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
+import mmap
 import os
 import tempfile
 from collections.abc import Callable
@@ -25,6 +26,9 @@ _T = TypeVar("_T")
 IN_MEMORY_BYTES = 32 * 1024 * 1024
 """Bytes of arrays that a store keeps in memory: those of a dozen frames with pictures of KITTI's size. Beyond
 that each is read in a tenth of a millisecond, and those of a long drive do not add up."""
+_MAPPED_BYTES = 128 * 1024
+"""Arrays of at least so many bytes are mapped: a match looks at a few hundred pixels of the 4 MB of a
+picture's gradients, and no more is read."""
 
 
 class ArrayStore:
@@ -80,12 +84,14 @@ class ArrayStore:
         return True
 
     def read(self, start: int, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-        """An array that lies in the file.
+        """An array that lies in the file; a large one cannot be written to.
 
         Raises:
             OSError: it cannot be read.
         """
         assert self._file is not None
+        if (mapped := _mapped(self._file.fileno(), start, dtype, shape)) is not None:
+            return mapped
         flat = np.empty(math.prod(shape), dtype)
         view, got = flat.view(np.uint8).data, 0
         while got < len(view):
@@ -93,6 +99,21 @@ class ArrayStore:
                 raise OSError(f"the temporary file of a drive ends {len(view) - got} bytes early")
             got += count
         return flat.reshape(shape)
+
+
+def _mapped(descriptor: int, start: int, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any] | None:
+    """A large array of a file, of which only what is looked at is read; None of a small one, or where the
+    file cannot be mapped."""
+    count = math.prod(shape)
+    if count * dtype.itemsize < _MAPPED_BYTES:
+        return None
+    before = start % mmap.ALLOCATIONGRANULARITY
+    length = before + count * dtype.itemsize
+    try:
+        view = mmap.mmap(descriptor, length, access=mmap.ACCESS_READ, offset=start - before)
+    except (OSError, ValueError):
+        return None
+    return np.frombuffer(view, dtype, count, before).reshape(shape)
 
 
 def _read_at(descriptor: int, view: memoryview, start: int) -> int:

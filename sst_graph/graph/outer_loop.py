@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
 
 import gtsam
@@ -110,27 +111,45 @@ class JointSolution:
 
     Attributes:
         state: the estimate.
-        matches: its matches, drive by drive, and
-        pairs: pair by pair.
-        graph, values: the last frozen graph and its optimum.
+        matches: its matches, drive by drive.
         outer_iterations: outer iterations done.
         converged: the last step was short compared with the sigmas of the frozen problem.
         matched_at: the state that the matches were made at.
         frozen, optimum: the last frozen problem and its optimum.
         iterations: how the estimate was reached.
+        problem: that was solved.
+        centre: what its weak priors were centred on.
     """
 
     state: State
     matches: Sequence[DriveMatches]
-    pairs: list[PairMatches]
-    graph: gtsam.NonlinearFactorGraph
-    values: gtsam.Values
     outer_iterations: int
     converged: bool
     matched_at: State
     frozen: FrozenProblem
     optimum: FrozenPoint
     iterations: tuple[OuterIteration, ...]
+    problem: JointProblem
+    centre: State
+
+    @cached_property
+    def pairs(self) -> list[PairMatches]:
+        """The matches pair by pair."""
+        return [pair for own in self.matches for pair in own.by_pair()]
+
+    @cached_property
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """The last frozen problem as a graph. Many solutions are compared by their states alone: it is made
+        where it is asked for."""
+        graph, _ = joint_graph(self.pairs, self.frozen.state, self.problem.config.graph, self.centre)
+        if self.problem.prior is not None:
+            graph.add(self.problem.prior)
+        return graph
+
+    @cached_property
+    def values(self) -> gtsam.Values:
+        """Its optimum."""
+        return self.frozen.values_at(self.optimum)
 
 
 def solve_joint(
@@ -188,25 +207,18 @@ def solve_joint_steps(
             if share * step < step_sigmas:
                 converged = step < OSCILLATION_SIGMAS
                 break
-    # 5. The last frozen problem as a graph.
-    found = [pair for own in matches for pair in own.by_pair()]
-    graph, _ = joint_graph(found, frozen.state, config.graph, centre)
-    if problem.prior is not None:
-        graph.add(problem.prior)
     _LOG.info("joint: %d outer iterations, %d pairs", outer + 1, pairs)
-    values = frozen.values_at(optimum)
     return JointSolution(
         state,
         matches,
-        found,
-        graph,
-        values,
         outer + 1,
         converged,
         frozen.state,
         frozen,
         optimum,
         tuple(iterations),
+        problem,
+        centre,
     )
 
 

@@ -112,3 +112,29 @@ def test_nothing_is_left_in_the_folder(tmp_path: Path, monkeypatch: pytest.Monke
     store.put(np.zeros(10_000))
     assert store.file_bytes == 80_000
     assert list(tmp_path.iterdir()) == []
+
+
+def test_large_arrays_are_mapped_and_small_ones_are_read() -> None:
+    large, small = np.arange(100_000, dtype=np.int32).reshape(1000, 100), np.arange(7, dtype=np.int32)
+    store = ArrayStore(0)
+    stored = [store.put(small), store.put(large), store.put(small), store.put(large + 1)]
+    found = [each.get() for each in stored]
+    for array, expected in zip(found, [small, large, small, large + 1], strict=True):
+        np.testing.assert_array_equal(array, expected)
+    assert [array.flags.writeable for array in found] == [True, False, True, False]
+    store.put(large)  # what is mapped stays where the file grows,
+    np.testing.assert_array_equal(found[3], large + 1)
+    store.__del__()  # and where it is closed
+    np.testing.assert_array_equal(found[1], large)
+
+
+def test_a_file_that_cannot_be_mapped_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    large = np.arange(100_000, dtype=np.int32)
+    store = ArrayStore(0)
+    stored = store.put(large)
+
+    def refused(*args: object, **kwargs: object) -> None:
+        raise OSError("no such device")
+
+    monkeypatch.setattr("sst_graph.files.array_store.mmap.mmap", refused)
+    np.testing.assert_array_equal(stored.get(), large)

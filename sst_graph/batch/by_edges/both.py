@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from sst_graph.batch.by_edges.fusion import Fused, state_of
-from sst_graph.batch.by_edges.label_parts import parted
-from sst_graph.batch.by_edges.method import LabelsSay, edges_method
+from sst_graph.batch.by_edges.label_parts import split_by_labels
+from sst_graph.batch.by_edges.method import LabelEstimate, edges_method
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import Guess, MethodEstimate
 from sst_graph.batch.motion_factor import MAX_DISAGREEMENT_CHI2
@@ -44,26 +44,26 @@ def both_method(
     Raises:
         EstimationError: neither labels nor edges give an estimate.
     """
-    with_labels, without = parted(drives)
+    with_labels, without = split_by_labels(drives)
     as_joint = replace(config, method="joint")
 
-    def align(begin: Guess) -> _Part:
+    def solve_labels(begin: Guess) -> _Part:
         if not with_labels:
             return "no class has labels on both sides"
         return _attempt(lambda: by_labels(with_labels, begin, as_joint, progress))
 
     # 1. Labels; they give edges their start where they know enough.
-    labels = align(guess)
+    labels = solve_labels(guess)
     # 2. Edges in the other frames.
     edges: _Part = "every frame has labels"
     if without:
-        edges = _attempt(lambda: edges_method(without, guess, config, progress, _says(labels)))
+        edges = _attempt(lambda: edges_method(without, guess, config, progress, _label_estimate(labels)))
     # 3. Labels that found nothing by themselves once more, from there.
-    if not _sound(labels) and _sound(edges):
+    if not _usable(labels) and _usable(edges):
         assert isinstance(edges, MethodEstimate)
-        labels = align(Guess(edges.cTl, edges.time_offset_s))
+        labels = solve_labels(Guess(edges.cTl, edges.time_offset_s))
     # 4. Both as one.
-    return as_one(labels, edges)
+    return fuse_parts(labels, edges)
 
 
 def _attempt(run: Callable[[], MethodEstimate]) -> _Part:
@@ -74,47 +74,47 @@ def _attempt(run: Callable[[], MethodEstimate]) -> _Part:
         return str(error)
 
 
-def _sound(part: _Part) -> bool:
-    return isinstance(part, MethodEstimate) and not _wrong(part)
+def _usable(part: _Part) -> bool:
+    return isinstance(part, MethodEstimate) and not _reasons_against(part)
 
 
-def _wrong(part: MethodEstimate) -> tuple[str, ...]:
+def _reasons_against(part: MethodEstimate) -> tuple[str, ...]:
     """Reasons against a part; whether sweeps matter is seen of both together."""
     return tuple(reason for reason in part.reasons if reason not in part.sweep_reasons)
 
 
-def _says(labels: _Part) -> LabelsSay:
-    if isinstance(labels, str) or _wrong(labels):
-        return LabelsSay()
+def _label_estimate(labels: _Part) -> LabelEstimate:
+    if isinstance(labels, str) or _reasons_against(labels):
+        return LabelEstimate()
     sure = bool((np.sqrt(np.diag(labels.covariance)) < _START_SIGMAS).all())
     has_motion = bool(labels.diagnostics["motion"].get("fused", False))
-    return LabelsSay(state_of(labels) if sure else None, has_motion)
+    return LabelEstimate(state_of(labels) if sure else None, has_motion)
 
 
-def as_one(labels: _Part, edges: _Part) -> MethodEstimate:
-    """The estimate from both parts, or from the one that is sound.
+def fuse_parts(labels: _Part, edges: _Part) -> MethodEstimate:
+    """The estimate from both parts, or from the one that is usable.
 
     Raises:
         EstimationError: neither is an estimate.
     """
     if isinstance(labels, str) and isinstance(edges, str):
         raise EstimationError(f"by labels: {labels}; by edges: {edges}")
-    if isinstance(edges, str) or (_wrong(edges) and _sound(labels)):
+    if isinstance(edges, str) or (_reasons_against(edges) and _usable(labels)):
         assert not isinstance(labels, str)
-        return _alone(labels, ("edges", edges))
-    if isinstance(labels, str) or (_wrong(labels) and _sound(edges)):
-        return _alone(edges, ("labels", labels))
-    if _wrong(labels):  # neither is sound
+        return _of_one_part(labels, ("edges", edges))
+    if isinstance(labels, str) or (_reasons_against(labels) and _usable(edges)):
+        return _of_one_part(edges, ("labels", labels))
+    if _reasons_against(labels):  # neither is usable
         reasons = [*(f"by labels: {each}" for each in labels.reasons)]
         reasons += [f"by edges: {each}" for each in edges.reasons]
         return replace(labels, reasons=tuple(reasons), solved=None)
-    return _of_both(labels, edges)
+    return _of_both_parts(labels, edges)
 
 
-def _alone(used: MethodEstimate, left_out: tuple[str, _Part]) -> MethodEstimate:
+def _of_one_part(used: MethodEstimate, left_out: tuple[str, _Part]) -> MethodEstimate:
     """One part, and why the other, of a name, was left out."""
     name, part = left_out
-    why = part if isinstance(part, str) else _wrong(part)[0]
+    why = part if isinstance(part, str) else _reasons_against(part)[0]
     remark = f"{name} were left out: {why}"
     facts = {} if isinstance(part, str) else {name: _facts(part)}
     return replace(
@@ -125,7 +125,7 @@ def _alone(used: MethodEstimate, left_out: tuple[str, _Part]) -> MethodEstimate:
     )
 
 
-def _of_both(labels: MethodEstimate, edges: MethodEstimate) -> MethodEstimate:
+def _of_both_parts(labels: MethodEstimate, edges: MethodEstimate) -> MethodEstimate:
     """The fused estimate; it may be wrong where the two contradict each other."""
     fused = Fused.of(labels, edges)
     static = edges.covariance

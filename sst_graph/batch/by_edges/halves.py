@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.batch.by_edges.covariance import SAMPLES
+from sst_graph.batch.by_edges.covariance import NEAR_KERNELS_PX, SAMPLES
 from sst_graph.batch.by_edges.reasons import MIN_OVER_OTHER
 from sst_graph.batch.contradictions import FALSE_ALARM
 from sst_graph.covariance.contradiction import Difference, PartEstimate, name_step
@@ -74,20 +74,27 @@ def _half(
         return None
     drive, tracks = problem.drives[number].part(scans), problem.tracks.part(number, scans)
     few = evenly_spread(range(len(scans)), _SEARCHED_SCANS)
-    edges = edges_of([drive.part(few)], tracks.part(0, few), problem.config.graph)
+    some = replace(problem, drives=[drive.part(few)], tracks=tracks.part(0, few))
+    edges = edges_of(some.drives, some.tracks, problem.config.graph)
     if not edges:
         return None
+    # 1. Every start on a few scans.
     region = SearchRegion(state.cTl, state.time_offsets_s[:1], (_HALF_DEG,) * 3)
     starts = [state, *(replace(state, cTl=start.cTl) for start in edge_starts(edges[0], region))]
     found: list[tuple[float, State]] = []
     for start in starts:
         try:
-            own = solve_joint(replace(problem, drives=[drive], tracks=tracks), start, KERNELS_PX).state
+            own = solve_joint(some, start, KERNELS_PX).state
         except EstimationError:
             continue
         # From another start a pose must agree clearly better, as between the optima of a whole drive.
         found.append((score(edges, own, _SCORE_PX) * (1.0 if start is state else 1.0 / MIN_OVER_OTHER), own))
     if not found:
         return None
+    # 2. The best of them on all.
     best = max(found, key=lambda one: one[0])[1]
+    try:
+        best = solve_joint(replace(problem, drives=[drive], tracks=tracks), best, NEAR_KERNELS_PX).state
+    except EstimationError:
+        return None
     return PartEstimate(difference(state, best), 2.0 * covariance, float(SAMPLES))

@@ -11,7 +11,7 @@ from sst_graph.drive.preparation import Drive, ImageFeatures, ScanFeatures
 from sst_graph.types import SemanticClass
 
 
-def parted(drives: Sequence[Drive]) -> tuple[list[Drive], list[Drive]]:
+def split_by_labels(drives: Sequence[Drive]) -> tuple[list[Drive], list[Drive]]:
     """(by labels, by edges) of drives that were prepared for both; those that have nothing are left out.
 
     A pair of scan and image is aligned by labels where both have some, and by edges elsewhere. A drive of

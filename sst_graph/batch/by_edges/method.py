@@ -16,7 +16,7 @@ from sst_graph.association.time_pairing import pair_by_time
 from sst_graph.batch.by_edges.covariance import NEAR_KERNELS_PX, edges_covariance
 from sst_graph.batch.by_edges.halves import halves_reasons
 from sst_graph.batch.by_edges.parts import thinned
-from sst_graph.batch.by_edges.reasons import EdgeContrast, drift_reasons, edge_contrast, edges_reasons
+from sst_graph.batch.by_edges.reasons import EdgeContrast, edge_contrast, edges_reasons, wider_kernel_reasons
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import Guess, MethodEstimate, frames_used
 from sst_graph.batch.motion_factor import gaussian_factor
@@ -98,14 +98,14 @@ class _Problem:
     motion: MotionSolution | None
 
     @cached_property
-    def some_edges(self) -> list[DriveEdges]:
+    def subset_edges(self) -> list[DriveEdges]:
         """Boundary points of the few scans."""
         return edges_of(self.some.drives, self.some.tracks, self.some.config.graph)
 
 
 @dataclass(frozen=True)
-class LabelsSay:
-    """What labels of other frames say.
+class LabelEstimate:
+    """What labels of other frames estimate.
 
     Attributes:
         state: their estimate; edges begin there, without a search. None where it is not known well enough.
@@ -121,7 +121,7 @@ def edges_method(
     guess: Guess,
     config: CalibrationConfig,
     progress: Progress | None,
-    labels: LabelsSay | None = None,
+    labels: LabelEstimate | None = None,
 ) -> MethodEstimate:
     """Extrinsic and time offset from edges; drives are prepared with objects without a class.
 
@@ -131,7 +131,7 @@ def edges_method(
     Raises:
         EstimationError: no start: neither a guess nor motion, or nothing in view.
     """
-    labels = labels or LabelsSay()
+    labels = labels or LabelEstimate()
     # 1. What motion says, before any edge is compared.
     motion = _motion_alone(drives, guess, config, progress)
     calibration = CalibrationProblem.of(drives, guess, config, progress)
@@ -146,18 +146,18 @@ def edges_method(
     solution = _best_optimum(problem, begin, restarts, progress)
     # 4. Covariance, with what halves of the objects disagree by, and edges that are farther away.
     estimate = JointEstimate.of(solution, calibration.objects)
-    wider = solve_joint(problem.whole, solution.state, _WIDER_PX)
-    drift = difference(solution.state, wider.state)
+    wider = solve_joint(problem.whole, solution.state, _WIDER_KERNEL_PX)
+    wider_step = difference(solution.state, wider.state)
     own = edges_covariance(problem.whole, estimate, calibration.objects, calibration.config.assumptions)
-    covariance = own.matrix + np.outer(drift, drift)
+    covariance = own.matrix + np.outer(wider_step, wider_step)
     sweeps = sweep_effects(calibration, solution, covariance)
     covariance = covariance + sweeps.covariance
     # 5. Has it worked?
     contrast = edge_contrast(
-        problem.some_edges, solution.state, [one.state for _, one in candidates], config.seed
+        problem.subset_edges, solution.state, [one.state for _, one in candidates], config.seed
     )
     reasons = edges_reasons(solution, contrast, motion, covariance, problem.centre)
-    reasons += drift_reasons(drift)
+    reasons += wider_kernel_reasons(wider_step)
     if config.check_contradictions:
         reasons += halves_reasons(problem.whole, solution.state, covariance)
     return MethodEstimate(
@@ -168,7 +168,7 @@ def edges_method(
         (*reasons, *own.reasons, *sweeps.reasons),
         by_static_objects=covariance,
         diagnostics=_diagnostics(solution, contrast, motion)
-        | {"spread": {**own.sigmas, "farther_edges": np.abs(drift).tolist()}},
+        | {"spread": {**own.sigmas, "farther_edges": np.abs(wider_step).tolist()}},
         by_sweeps=sweeps.covariance,
         sweep_reasons=sweeps.reasons,
         shared=own.shared,
@@ -195,7 +195,9 @@ def _motion_alone(
     return possible[0]
 
 
-def _problem(calibration: CalibrationProblem, motion: MotionSolution | None, labels: LabelsSay) -> _Problem:
+def _problem(
+    calibration: CalibrationProblem, motion: MotionSolution | None, labels: LabelEstimate
+) -> _Problem:
     """The problem, with the search around what guess and motion say together.
 
     Raises:
@@ -304,9 +306,9 @@ def _starts(problem: _Problem) -> list[State]:
     Raises:
         EstimationError: none.
     """
-    if not problem.some_edges:
+    if not problem.subset_edges:
         raise EstimationError("no LiDAR edge in any scan")
-    richest = max(problem.some_edges, key=len)
+    richest = max(problem.subset_edges, key=len)
     found = edge_starts(richest, problem.region)
     if not found:
         raise EstimationError("no LiDAR edge in any picture")
@@ -326,7 +328,7 @@ def _refined(problem: _Problem, starts: Sequence[State]) -> list[tuple[float, Jo
         except EstimationError as error:
             failures.append(error)
             continue
-        found.append((score(problem.some_edges, solution.state, SCORE_PX), solution))
+        found.append((score(problem.subset_edges, solution.state, SCORE_PX), solution))
     if not found:
         raise failures[0]
     return sorted(found, key=lambda pair: -pair[0])
@@ -335,19 +337,19 @@ def _refined(problem: _Problem, starts: Sequence[State]) -> list[tuple[float, Jo
 def _best_optimum(problem: _Problem, start: State, restarts: int, progress: Progress | None) -> JointSolution:
     """The solution on all scans that no turn leads away from to a better one."""
     wide = solve_joint(problem.whole, start, KERNELS_PX, progress)
-    best, agreed = _climbed(problem.whole, wide.state, progress)
+    best, best_score = _newton_ascent(problem.whole, wide.state, progress)
     for _ in range(restarts):
-        other = _better_on_some(problem, best)
+        other = _better_nearby(problem, best)
         if other is None:
             break
-        again, agrees = _climbed(problem.whole, other, progress)
-        if agrees < _BETTER * agreed:
+        again, found_score = _newton_ascent(problem.whole, other, progress)
+        if found_score < _BETTER * best_score:
             break
-        best, agreed = again, agrees
-    return _settled(problem.whole, best, progress)
+        best, best_score = again, found_score
+    return _converged(problem.whole, best, progress)
 
 
-def _better_on_some(problem: _Problem, state: State) -> State | None:
+def _better_nearby(problem: _Problem, state: State) -> State | None:
     """An optimum on a few scans that agrees better than the one at a state; None where none is found."""
     t = state.cTl.translation()
     rotations = turned(state.cTl, np.radians(_TURNS_DEG))
@@ -355,50 +357,50 @@ def _better_on_some(problem: _Problem, state: State) -> State | None:
     found = []
     for start in starts:
         try:
-            found.append(_climbed(problem.some, start, None))
+            found.append(_newton_ascent(problem.some, start, None))
         except EstimationError:
             if start is state:
                 return None
     (_, own), *others = found
-    other, agrees = max(others, key=lambda one: one[1], default=(state, 0.0))
-    return other if agrees >= _BETTER * own else None
+    other, found_score = max(others, key=lambda one: one[1], default=(state, 0.0))
+    return other if found_score >= _BETTER * own else None
 
 
-def _climbed(problem: JointProblem, start: State, progress: Progress | None) -> tuple[State, float]:
+def _newton_ascent(problem: JointProblem, start: State, progress: Progress | None) -> tuple[State, float]:
     """A state near the optimum that a start leads to, and its score, by few long steps: each point is matched
     to the peak of its edge, which Newton's method says, until the score gains too little to count."""
     graph = replace(problem.config.graph, edge_peaks=True)
     by_peaks = replace(problem, config=replace(problem.config, graph=graph))
     edges = edges_of(problem.drives, problem.tracks, graph)
-    state, agrees = start, 0.0
-    for _ in range(_ROUNDS):
+    state, found_score = start, 0.0
+    for _ in range(_MAX_ROUNDS):
         state = solve_joint(by_peaks, state, NEAR_KERNELS_PX, progress).state
-        before, agrees = agrees, score(edges, state, SCORE_PX)
-        if agrees < _GAIN * before:
+        before, found_score = found_score, score(edges, state, SCORE_PX)
+        if found_score < _GAIN * before:
             break
-    return state, agrees
+    return state, found_score
 
 
-def _settled(problem: JointProblem, start: State, progress: Progress | None) -> JointSolution:
+def _converged(problem: JointProblem, start: State, progress: Progress | None) -> JointSolution:
     """The solution by near edges from a start that is nearly right.
 
     Soft matches follow the pose, so that steps are too short: the scales are gone through until nothing
     moves.
     """
     state = start
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         solution = solve_joint(problem, state, NEAR_KERNELS_PX, progress)
-        if (np.abs(difference(state, solution.state)) < _SETTLED).all():
+        if (np.abs(difference(state, solution.state)) < _CONVERGED_STEP).all():
             break
         state = solution.state
     return solution
 
 
-_ROUNDS = 10
+_MAX_ROUNDS = 10
 """Most times that the near scales are gone through."""
-_SETTLED = np.array([*np.radians([0.02] * 3), 0.005, 0.005, 0.005, 0.003])
+_CONVERGED_STEP = np.array([*np.radians([0.02] * 3), 0.005, 0.005, 0.005, 0.003])
 """(7,) a round that moves by no more is the last [rad, m, s]."""
-_WIDER_PX = (3.0,)
+_WIDER_KERNEL_PX = (3.0,)
 """Scale of the kernel under which an estimate is solved once more [px]: where it moves, it hangs on which of
 several edges nearby are met, and the step is a deviation of its covariance."""
 

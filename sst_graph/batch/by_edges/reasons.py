@@ -36,9 +36,9 @@ MAX_MOTION_CHI2 = 33.0
 contradict."""
 _FLOOR = np.array([*np.radians([0.5] * 3), 0.005])
 """Added to the sigmas of that difference [rad, s]."""
-MAX_DRIFT = np.array([*np.radians([0.1] * 3), 0.025, 0.025, 0.025, 0.015])
+MAX_WIDER_KERNEL_STEP = np.array([*np.radians([0.1] * 3), 0.025, 0.025, 0.025, 0.015])
 """(7,) farthest that an estimate may move where it is solved again with edges up to 3 px away [rad, m, s]."""
-MAX_AWAY_M = 0.35
+MAX_FROM_GUESS_M = 0.35
 """Farthest that an estimate may lie from the guess: it is bound to it [m]."""
 
 
@@ -82,9 +82,9 @@ def edge_contrast(
     return EdgeContrast(own, (own - float(np.mean(around))) / spread, own / max(max(around), 1e-9), other)
 
 
-def drift_reasons(step: FloatArray) -> tuple[str, ...]:
+def wider_kernel_reasons(step: FloatArray) -> tuple[str, ...]:
     """Why an estimate may be wrong that moves by a step (7,) where edges farther away are met too."""
-    if (np.abs(step) <= MAX_DRIFT).all():
+    if (np.abs(step) <= MAX_WIDER_KERNEL_STEP).all():
         return ()
     return (
         "solved again with edges farther away the estimate moves by "
@@ -126,9 +126,9 @@ def edges_reasons(
                 f"{1e3 * step[3]:+.1f} ms away (chi-squared {chi2:.0f} of 4)"
             )
     away = float(np.linalg.norm(solution.state.cTl.translation() - centre.cTl.translation()))
-    if away > MAX_AWAY_M:
+    if away > MAX_FROM_GUESS_M:
         reasons.append(
             f"the estimate lies {away:.2f} m from the guess, farther than edges can tell (at most "
-            f"{MAX_AWAY_M:g} m)"
+            f"{MAX_FROM_GUESS_M:g} m)"
         )
     return tuple(reasons)

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from stored import simulated
 
 from sst_graph import CalibrationConfig, calibrate
-from sst_graph.batch.by_edges.both import as_one
+from sst_graph.batch.by_edges.both import fuse_parts
 from sst_graph.batch.by_edges.choice import with_method_for, with_method_of
 from sst_graph.batch.by_edges.fusion import Fused
-from sst_graph.batch.by_edges.label_parts import parted
+from sst_graph.batch.by_edges.label_parts import split_by_labels
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.batch.method_estimate import Guess, MethodEstimate
 from sst_graph.batch.problem import CalibrationProblem
@@ -71,7 +71,7 @@ def prepared() -> Drive:
 
 @cache
 def parts() -> tuple[Drive, Drive]:
-    (by_labels,), (by_edges,) = parted([prepared()])
+    (by_labels,), (by_edges,) = split_by_labels([prepared()])
     return by_labels, by_edges
 
 
@@ -92,11 +92,11 @@ def test_labels_and_edges_are_of_different_pairs() -> None:
 
 def test_a_whole_drive_goes_one_way() -> None:
     labelled = prepare_drives([with_labels_in(SMALL, 1)], CalibrationConfig(method="both"))
-    by_labels, by_edges = parted(labelled)
+    by_labels, by_edges = split_by_labels(labelled)
     assert len(by_labels) == 1 and by_edges == []
     assert not any(OBJECT in image.contours for image in by_labels[0].images)
     assert any(by_labels[0].scans[0].lower_edges)
-    by_labels, by_edges = parted([replace(prepared(), scans=parts()[1].scans)])
+    by_labels, by_edges = split_by_labels([replace(prepared(), scans=parts()[1].scans)])
     assert by_labels == [] and by_edges[0].labelled_ns == (frozenset(), frozenset())
 
 
@@ -218,10 +218,10 @@ def test_parts_that_contradict_each_other_are_not_trusted() -> None:
     sigmas = np.array([*np.radians([0.1] * 3), 0.01, 0.01, 0.01, 0.003])
     one = estimate(gtsam.Pose3(), 0.0, sigmas)
     near, far, farther = (estimate(gtsam.Pose3(), k * 0.003 * np.sqrt(2.0), sigmas) for k in (1, 4, 7))
-    assert as_one(one, near).reasons == () and as_one(one, far).reasons == ()
-    np.testing.assert_allclose(as_one(one, near).covariance, np.diag(sigmas**2) / 2.0)
-    np.testing.assert_allclose(as_one(one, far).covariance, np.diag(sigmas**2) / 2.0 * 16.0 / 7.0)
-    (reason,) = as_one(one, farther).reasons
+    assert fuse_parts(one, near).reasons == () and fuse_parts(one, far).reasons == ()
+    np.testing.assert_allclose(fuse_parts(one, near).covariance, np.diag(sigmas**2) / 2.0)
+    np.testing.assert_allclose(fuse_parts(one, far).covariance, np.diag(sigmas**2) / 2.0 * 16.0 / 7.0)
+    (reason,) = fuse_parts(one, farther).reasons
     assert "contradict each other" in reason and "+29.7 ms" in reason
 
 
@@ -230,20 +230,20 @@ def test_undecided_sweeps_are_judged_by_what_they_do_to_both() -> None:
     one = estimate(gtsam.Pose3(), 0.0, sigmas, "sweep")
     for share, reasons in ((0.05, ()), (0.9, ("sweep",))):
         part = replace(one, by_sweeps=share * one.covariance, sweep_reasons=("sweep",))
-        assert as_one(part, replace(part, reasons=(), sweep_reasons=())).reasons == reasons
-        assert as_one(part, part).reasons == reasons
+        assert fuse_parts(part, replace(part, reasons=(), sweep_reasons=())).reasons == reasons
+        assert fuse_parts(part, part).reasons == reasons
 
 
 def test_what_is_not_sound_is_left_out() -> None:
     sigmas = np.full(7, 0.01)
     good, bad = estimate(gtsam.Pose3(), 0.01, sigmas), estimate(gtsam.Pose3(), 0.5, sigmas, "moved")
-    for found, name in ((as_one(good, bad), "edges"), (as_one(bad, good), "labels")):
+    for found, name in ((fuse_parts(good, bad), "edges"), (fuse_parts(bad, good), "labels")):
         assert found.time_offset_s == 0.01 and found.reasons == ()
         assert found.remarks == (f"{name} were left out: moved",)
-    assert as_one(good, "nothing in view").remarks == ("edges were left out: nothing in view",)
-    assert as_one(bad, bad).reasons == ("by labels: moved", "by edges: moved")
+    assert fuse_parts(good, "nothing in view").remarks == ("edges were left out: nothing in view",)
+    assert fuse_parts(bad, bad).reasons == ("by labels: moved", "by edges: moved")
     with pytest.raises(EstimationError, match=r"by labels: none; by edges: nothing"):
-        as_one("none", "nothing")
+        fuse_parts("none", "nothing")
 
 
 # --- the whole method

@@ -20,7 +20,7 @@ from sst_graph.batch.by_edges.covariance import (
 )
 from sst_graph.batch.by_edges.parts import thinned, with_objects, without_kind
 from sst_graph.batch.by_edges.positions import position_columns
-from sst_graph.batch.by_edges.reasons import MAX_DRIFT, drift_reasons
+from sst_graph.batch.by_edges.reasons import MAX_WIDER_KERNEL_STEP, wider_kernel_reasons
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.batch.method_estimate import Guess
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
@@ -122,8 +122,8 @@ def test_upper_edges_that_may_be_no_outline_are_told_apart(drive: Drive) -> None
 
 
 def test_an_estimate_that_moves_when_it_is_solved_again_is_not_trusted() -> None:
-    assert drift_reasons(0.9 * MAX_DRIFT) == ()
-    (reason,) = drift_reasons(np.array([0.0, -0.0035, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    assert wider_kernel_reasons(0.9 * MAX_WIDER_KERNEL_STEP) == ()
+    (reason,) = wider_kernel_reasons(np.array([0.0, -0.0035, 0.0, 0.0, 0.0, 0.0, 0.0]))
     assert "0.20 deg" in reason
 
 
