@@ -156,7 +156,7 @@ def described(value: Any) -> str:
     if isinstance(value, type):
         return f"the class {value.__name__}"
     name = type(value).__name__
-    article = "an" if name[0] in "AEIOUaeiou" else "a"
+    article = "an" if name[0] in "AEIOaeio" else "a"
     return f"{article} {name} of {len(value)}" if isinstance(value, list | tuple) else f"{article} {name}"
 
 

@@ -112,12 +112,14 @@ def number_or_key(factor: str, argument: str, value: Any) -> int | float:
     return float(array.item())
 
 
-def checked_values(what: str, values: Any, factors: Iterable[gtsam.NonlinearFactor]) -> None:
-    """Nothing, where ``values`` has one for each key of the factors."""
+def checked_values(
+    what: str, values: Any, factors: Iterable[gtsam.NonlinearFactor], further: Iterable[int] = ()
+) -> None:
+    """Nothing, where ``values`` has one for each key of the factors, and for the further keys."""
     checked_type(what, values, gtsam.Values, "a gtsam.Values")
-    for key in sorted({int(key) for factor in factors for key in list(factor.keys())}):
+    for key in sorted({*further, *(int(key) for factor in factors for key in list(factor.keys()))}):
         if not values.exists(key):
-            raise FactorError(what, f"no {key_name(key)}", "a value for each key of the factors")
+            raise FactorError(what, f"no {key_name(key)}", "a value for each key of the graph")
 
 
 def checked_keys(factor: str, keys: Sequence[Any] | Mapping[str, Any]) -> dict[int, str]:

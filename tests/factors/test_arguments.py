@@ -77,7 +77,8 @@ def test_no_positive_numbers(value: object) -> None:
         ("abc", "the text 'abc'"),
         (np.float64(1.5), "1.5"),
         (10**50, "an int of more than 40 digits"),
-        (gtsam.noiseModel.Isotropic.Sigma(1, 1.0), "an Isotropic"),
+        (gtsam.noiseModel.Isotropic.Sigma(1, 2.0), "an Isotropic"),
+        (gtsam.noiseModel.Unit.Create(1), "a Unit"),
         (gtsam.Pose3, "the class Pose3"),
     ],
 )

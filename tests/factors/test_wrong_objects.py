@@ -8,23 +8,24 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, D, E, T, V, X
+from wrong_objects import POSE, PRIOR, PRIORS, UNIT, WRONG
 
 from sst_graph import factors
 from sst_graph.factors import FactorError
-from tests.factors.conftest import KITTI, scene
 
-POINTS, _, _, TWIST = scene(1, n=5)
-OUTLINE = scene(2, n=5, normals=True)[0]
-POSE = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.2, 0.3), np.array([0.1, 0.2, 0.3]))
-BROKEN = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, np.nan, 0.0]))
+CAMERA = factors.PinholeCamera(700.0, 700.0, 600.0, 180.0, 1242, 375)
+TWIST = np.array([0.1, 0.2, 0.1, 1.0, 0.5, 8.0])
+LPS, PIXELS = np.array([[1.0, 2.0, 8.0 + k] for k in range(5)]), np.array([[600.0, 180.0]] * 5)
+POINTS = factors.Alignment(CAMERA, LPS, 0.1, PIXELS, 1.0)  # type: ignore[arg-type]  # one number for all
+OUTLINE = replace(POINTS, normals=np.array([[1.0, 0.0]] * 5))
 COVARIANCE = 0.01 * np.eye(6)
-UNIT = gtsam.noiseModel.Unit.Create(6)
 BETWEEN = factors.Between(X(0), X(1), 0.1, 0.02)
 CAMERA_MOTION = factors.CameraMotion(POSE, COVARIANCE)
 LIDAR_MOTION = factors.LidarMotion(POSE, TWIST, TWIST, 0.0)
@@ -32,24 +33,15 @@ FRAME = factors.frame_factor([POINTS], E(0), D(0), V(0))
 VALUES = gtsam.Values()
 for _key, _value in ((E(0), POSE), (D(0), np.array([0.1])), (V(0), TWIST)):
     VALUES.insert(_key, _value)
-PRIORS = gtsam.NonlinearFactorGraph()
-PRIORS.add(gtsam.PriorFactorPose3(E(0), POSE, UNIT))
-PRIOR = PRIORS.at(0)
 
 
 def _identity(vector: np.ndarray, *, jacobians: bool) -> tuple[np.ndarray, list[np.ndarray] | None]:
     return vector, [np.eye(6)] if jacobians else None
 
 
-def _of_another(this: gtsam.CustomFactor, values: gtsam.Values, H: list[np.ndarray] | None) -> np.ndarray:
-    if H is not None:
-        H[0] = np.eye(6, order="F")
-    return np.asarray(values.atVector(V(0)))
-
-
 RIGHT: dict[str, dict[str, Any]] = {
     "Alignment": {
-        "camera": KITTI,
+        "camera": CAMERA,
         "lPs": OUTLINE.lPs,
         "base_taus_s": 0.1,
         "pixels": OUTLINE.pixels,
@@ -214,41 +206,6 @@ RIGHT: dict[str, dict[str, Any]] = {
 MADE_HERE = {"RigidlyMoved", "PointwiseMoved", "JacobianBlock", "JacobianReport", "GncSolution"}
 """Results: the package makes them, a caller reads them."""
 NO_CALLABLES = {"Kind", "KernelKind", "MotionModel", "MIN_DEPTH_M", "FactorError"}
-
-WRONG: dict[str, Any] = {
-    "array": np.zeros(3),
-    "matrix": np.eye(4),
-    "NaN points": np.full((5, 3), np.nan),
-    "points of two": np.zeros((5, 2)),
-    "complex": np.zeros(6, complex),
-    "Pose2": gtsam.Pose2(),
-    "Pose3": POSE,
-    "Pose3 with NaN": BROKEN,
-    "Rot3": gtsam.Rot3(),
-    "noise model": gtsam.noiseModel.Isotropic.Sigma(6, 0.1),
-    "factor": PRIOR,
-    "other's factor": gtsam.CustomFactor(UNIT, [V(0)], _of_another),
-    "graph": PRIORS,
-    "no values": gtsam.Values(),
-    "text": "E0",
-    "bytes": b"E0",
-    "int": 7,
-    "negative": -7,
-    "many digits": 10**5000,
-    "float": 0.7,
-    "NaN": float("nan"),
-    "None": None,
-    "True": True,
-    "list": [1.0, 2.0, 3.0],
-    "texts": ["1", "2", "3"],
-    "ragged": [[1.0], [1.0, 2.0]],
-    "empty": [],
-    "dict": {},
-    "set": {1.5},
-    "class": gtsam.Pose3,
-    "function": len,
-    "object": object(),
-}
 
 KEY, NUMBER, POSITIVE = {"int"}, {"int", "negative", "float"}, {"int", "float"}
 KEY_OR_NUMBER, KEY_OR_POSE = {"int", "float"}, {"int", "Pose3"}
