@@ -301,7 +301,8 @@ def _held_biases(
         response = -P @ sums.claimed[:, column]  # of the variables to the bias
         follows = response.copy()
         follows[column] = 1.0
-        S = float(follows @ sums.claimed[:, column]) + MASK_BIAS_PRIOR_PX**-2
+        # 0 where the graph holds less than the matches: not theirs, or scaled down
+        S = max(float(follows @ sums.claimed[:, column]), 0.0) + MASK_BIAS_PRIOR_PX**-2
         # What the variables know beyond these matches (priors, motion) does not err with them.
         sigma = float(np.sqrt(np.maximum(follows @ variance @ follows, 0.0))) / S
         found[c] = -float(sums.gradient[column]) / S, sigma
