@@ -84,7 +84,7 @@ def checked_finite(what: str, array: FloatArray) -> None:
 
 
 def _wanted(shape: tuple[int | None, ...]) -> str:
-    return "(" + ", ".join("n" if n is None else str(n) for n in shape) + ")"
+    return "(" + ", ".join("n" if n is None else str(n) for n in shape) + (",)" if len(shape) == 1 else ")")
 
 
 def checked_covariance(what: str, value: ArrayLike, size: int) -> FloatArray:
