@@ -140,7 +140,10 @@ def _next(inspection: Inspection) -> str:
         "What is weak, and what to record next",
         bullets(short) if short else paragraph(nothing),
         details("The reasons in full", bullets([*result.reasons, *weak])) if result.reasons else "",
-        paragraph("What to record next, by the information that the frames of this record gave:")
+        paragraph(
+            "What to record next, by the information that the frames of this record gave "
+            "(standard deviations, now -> then):"
+        )
         if advice
         else "",
         bullets(one[0].upper() + one[1:] + "." for one in advice),
