@@ -37,6 +37,7 @@ Eigen::Matrix<double, Rows, Cols> matrix(const Json& rows) {
 
 Marginal read(const std::string& path) {
   std::ifstream file(path);
+  if (!file) throw std::runtime_error(path + ": cannot be opened");
   const Json j = Json::parse(file);
   if (j.at("format") != "sst-graph/marginal" || j.at("version") != 1)
     throw std::runtime_error(path + ": not an sst-graph/marginal of version 1");

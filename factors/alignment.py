@@ -18,8 +18,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from .arguments import checked_array, checked_positive, described
-from .condensed import condense, condense_root, cost_rows
+from .arguments import checked_array, checked_number, checked_positive, checked_type, described
+from .condensed import condense_gram, condense_root, cost_rows
 from .custom.factor import custom_factor, recipe_of
 from .custom.variables import Argument, Variables, Vector, checked_key, is_key, number_or_key, pose_or_key
 from .errors import FactorError
@@ -44,6 +44,7 @@ FloatArray = NDArray[np.float64]
 _COLUMNS = {"cTl": range(0, 6), "time_offset_s": range(6, 7), "c_twist": range(7, 13)}
 """Where each quantity stands among the Jacobian's columns; biases follow, the residual is last."""
 _NAME = "frame_factor"
+_AN_ALIGNMENT = "a sst_graph.factors.Alignment"
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,10 +54,28 @@ class GroupedBias:
     Attributes:
         biases: key of each object's bias, or a fixed bias [px].
         groups: (n,) position in ``biases`` for each match.
+
+    Raises:
+        FactorError: something else than keys or numbers, or positions that are none.
     """
 
     biases: tuple[int | float, ...]
     groups: NDArray[np.intp]
+
+    def __post_init__(self) -> None:
+        expected = "a sequence of keys or of numbers"
+        checked_type("biases of a GroupedBias", self.biases, (list, tuple, np.ndarray), expected)
+        for bias in self.biases:
+            number_or_key("a GroupedBias", "biases", bias)
+        groups = checked_array("groups of a GroupedBias", self.groups, (None,))
+        positions = np.asarray(self.groups, dtype=np.intp)
+        least, most = positions.min(initial=0), positions.max(initial=-1)
+        if (positions != groups).any() or least < 0 or most >= len(self.biases):
+            found = f"{groups.min():g} to {groups.max():g}"
+            expected = f"positions in {len(self.biases)} biases"
+            raise FactorError("groups of a GroupedBias", found, expected)
+        object.__setattr__(self, "groups", positions)
+        object.__setattr__(self, "biases", tuple(self.biases))
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +88,21 @@ class LinearTerm:
         key: of theta (``Vector(1)``).
         coefficients: (n,) derivative of each match's residual by theta [px per unit].
         at: value of theta at which the matches were made.
+
+    Raises:
+        FactorError: no key, or no numbers.
     """
 
     key: int
     coefficients: FloatArray
     at: float = 0.0
+
+    def __post_init__(self) -> None:
+        store = object.__setattr__
+        store(self, "key", checked_key("a linear term", "key", self.key))
+        checked = checked_array("coefficients of a linear term", self.coefficients, (None,))
+        store(self, "coefficients", checked)
+        store(self, "at", checked_number("at of a linear term", self.at))
 
 
 def point_to_pixel_factor(
@@ -86,7 +115,7 @@ def point_to_pixel_factor(
 
     SST-Calib, eq. 2. See :func:`frame_factor` for the arguments.
     """
-    _require_points(alignment)
+    _require_points("point_to_pixel_factor", alignment)
     return frame_factor([alignment], cTl, time_offset_s, c_twist)
 
 
@@ -101,7 +130,7 @@ def pixel_to_point_factor(
     SST-Calib, eq. 3: the same residual as :func:`point_to_pixel_factor` over matches found the other
     way round (a point may occur many times); its weight w_l n_p / n_i is the alignment's ``weights``.
     """
-    _require_points(alignment)
+    _require_points("pixel_to_point_factor", alignment)
     return frame_factor([alignment], cTl, time_offset_s, c_twist)
 
 
@@ -122,12 +151,14 @@ def silhouette_factor(
     Raises:
         FactorError: the alignment has no normals.
     """
+    checked_type("alignment of silhouette_factor", alignment, Alignment, _AN_ALIGNMENT)
     if alignment.normals is None:
         raise FactorError("alignment of a silhouette", "no normals", "unit normals (n, 2)")
     return frame_factor([alignment], cTl, time_offset_s, c_twist, bias_px)
 
 
-def _require_points(alignment: Alignment) -> None:
+def _require_points(factor: str, alignment: Alignment) -> None:
+    checked_type(f"alignment of {factor}", alignment, Alignment, _AN_ALIGNMENT)
     if alignment.normals is not None:
         raise FactorError("alignment", "normals", "none: silhouettes have silhouette_factor")
 
@@ -355,7 +386,7 @@ class FrameResidual:
         weighted = [self._weighted(part, values) for part in self.parts]
         counts = [len(evaluated.rows) for evaluated, _ in weighted]
         if sum(counts) > self.cols + 1:
-            return condense(*self._gram(weighted))
+            return condense_gram(*self._gram(weighted))
         # There are roots at once: those of the rows' short forms.
         R, end = np.zeros((sum(counts), self.cols + 1)), 0
         for part, (evaluated, _), count in zip(self.parts, weighted, counts, strict=True):
@@ -405,11 +436,11 @@ def frame_residual(
     name: str = _NAME,
 ) -> FrameResidual:
     """The residual behind :func:`frame_factor`, whose arguments these are; ``name`` is for errors."""
+    checked_type(f"alignments of {name}", alignments, (list, tuple), f"a list, each {_AN_ALIGNMENT}")
     if not alignments:
         raise FactorError(f"alignments of {name}", "none", "one or more")
     for alignment in alignments:
-        if not isinstance(alignment, Alignment):
-            raise FactorError(f"alignments of {name}", described(alignment), "sst_graph.factors.Alignment")
+        checked_type(f"alignments of {name}", alignment, Alignment, _AN_ALIGNMENT)
         if alignment.c_acceleration.ndim > 1:
             found = f"shape {alignment.c_acceleration.shape}"
             raise FactorError(f"c_acceleration of {name}", found, "shape (6,): the matches of one image")
@@ -490,17 +521,9 @@ def _bias_of_each(alignments: Sequence[Alignment], biases_px: Any) -> list[int |
             raise FactorError(
                 "biases_px", "a bias for point-to-pixel matches", "None: only silhouettes have one"
             )
-        if isinstance(bias, GroupedBias) and (
-            bias.groups.shape != (len(alignment),)
-            or bias.groups.dtype.kind not in "iu"
-            or bias.groups.min(initial=0) < 0
-            or bias.groups.max(initial=-1) >= len(bias.biases)
-        ):
-            raise FactorError(
-                "groups of a GroupedBias",
-                f"shape {bias.groups.shape}, up to {bias.groups.max(initial=-1)}",
-                f"({len(alignment)},), positions in {len(bias.biases)} biases",
-            )
+        if isinstance(bias, GroupedBias) and len(bias.groups) != len(alignment):
+            found = f"shape {bias.groups.shape}"
+            raise FactorError("groups of a GroupedBias", found, f"shape ({len(alignment)},), one a match")
     return biases
 
 
@@ -510,12 +533,15 @@ def _terms_of_each(
     """The terms of each alignment, their shapes checked."""
     if terms is None:
         return [()] * len(alignments)
+    checked_type("terms", terms, (list, tuple), "a list of LinearTerm for each alignment")
     if len(terms) != len(alignments):
         raise FactorError("terms", f"{len(terms)} entries", f"{len(alignments)}, one an alignment")
     for alignment, own in zip(alignments, terms, strict=True):
+        checked_type("terms of an alignment", own, (list, tuple), "a list of LinearTerm")
         if own and alignment.normals is None:
             raise FactorError("terms", "one for point-to-pixel matches", "none: only silhouettes have them")
         for term in own:
+            checked_type("terms of an alignment", term, LinearTerm, "a sst_graph.factors.LinearTerm")
             checked_array("coefficients of a linear term", term.coefficients, (len(alignment),))
     return list(terms)
 

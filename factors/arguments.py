@@ -1,9 +1,11 @@
-"""Checks of arguments: shapes, finite numbers, covariances."""
+"""Checks of arguments: types, shapes, finite numbers, poses, covariances."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
+import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -12,22 +14,77 @@ from .errors import FactorError
 FloatArray = NDArray[np.float64]
 
 
+def checked_type(what: str, value: Any, kind: type | tuple[type, ...], expected: str) -> None:
+    """Nothing, where ``value`` is of the kind.
+
+    Raises:
+        FactorError: it is not; ``expected`` says in words what it should be.
+    """
+    if not isinstance(value, kind):
+        raise FactorError(what, described(value), expected)
+
+
+def checked_gtsam(what: str, value: Any, kind: type) -> None:
+    """Nothing, where ``value`` is of this class of gtsam, and its numbers are finite where it is a pose or a
+    rotation."""
+    checked_type(what, value, kind, f"a gtsam.{kind.__name__}")
+    if isinstance(value, gtsam.Pose3 | gtsam.Rot3) and not np.isfinite(value.matrix()).all():
+        raise FactorError(what, f"a {kind.__name__} that holds NaN or inf", "finite values")
+
+
 def checked_array(what: str, value: ArrayLike, shape: tuple[int | None, ...]) -> FloatArray:
     """A read-only float64 copy of ``value`` with the given shape (None: any length), all finite."""
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise FactorError(what, described(value), f"numbers of shape {_wanted(shape)}") from None
+    array = np.array(as_numbers(what, value, _wanted(shape)))
     if array.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
-        raise FactorError(what, f"shape {array.shape}", f"shape {_wanted(shape)}")
-    if not np.isfinite(array).all():
-        raise FactorError(what, f"{np.count_nonzero(~np.isfinite(array))} values NaN or inf", "finite values")
+        found = f"shape {array.shape}" if array.ndim else described(value)
+        raise FactorError(what, found, f"shape {_wanted(shape)}")
+    checked_finite(what, array)
     array.flags.writeable = False
     return array
 
 
+def checked_number_or_array(what: str, value: ArrayLike, shape: tuple[int | None, ...]) -> float | FloatArray:
+    """One finite number, or an array as of :func:`checked_array`."""
+    array = as_numbers(what, value, f"{_wanted(shape)}, or one number")
+    return checked_array(what, array, shape) if array.ndim else checked_number(what, float(array))
+
+
+def checked_rows(what: str, value: ArrayLike, columns: int) -> FloatArray:
+    """``value`` as a float64 array (n, columns), not copied where it is one; NaN may be in it."""
+    array = as_numbers(what, value, f"(n, {columns})")
+    if array.ndim != 2 or array.shape[1] != columns:
+        found = f"shape {array.shape}" if array.ndim else described(value)
+        raise FactorError(what, found, f"shape (n, {columns})")
+    return array
+
+
+def as_numbers(what: str, value: ArrayLike, shape: str = "") -> FloatArray:
+    """``value`` as a float64 array of any shape, not copied where it is one; texts, True and False are
+    no numbers.
+
+    Args:
+        shape: that is expected, for the message.
+    """
+    if isinstance(value, np.ndarray) and value.dtype == np.float64:
+        return value
+    expected = f"numbers of shape {shape}" if shape else "numbers"
+    try:
+        array = np.asarray(value)
+        if array.dtype.kind not in "iuf":
+            raise TypeError
+        return np.asarray(array, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise FactorError(what, described(value), expected) from None
+
+
+def checked_finite(what: str, array: FloatArray) -> None:
+    """Nothing, where no value is NaN or inf."""
+    if not np.isfinite(array).all():
+        raise FactorError(what, f"{np.count_nonzero(~np.isfinite(array))} values NaN or inf", "finite values")
+
+
 def _wanted(shape: tuple[int | None, ...]) -> str:
-    return "(" + ", ".join("n" if n is None else str(n) for n in shape) + ")"
+    return "(" + ", ".join("n" if n is None else str(n) for n in shape) + (",)" if len(shape) == 1 else ")")
 
 
 def checked_covariance(what: str, value: ArrayLike, size: int) -> FloatArray:
@@ -47,22 +104,61 @@ def checked_covariance(what: str, value: ArrayLike, size: int) -> FloatArray:
 
 def checked_number(what: str, value: float) -> float:
     """A finite number."""
-    return float(checked_array(what, [value], (1,))[0])
+    if not _is_finite(value):
+        raise FactorError(what, described(value), "a finite number")
+    return float(value)
 
 
 def checked_positive(what: str, value: float) -> float:
     """A finite number above zero."""
-    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    if not (number and np.isfinite(value) and value > 0.0):
-        raise FactorError(what, f"{value}" if number else described(value), "a finite number above 0")
+    if not (_is_finite(value) and value > 0.0):
+        raise FactorError(what, described(value), "a finite number above 0")
     return float(value)
+
+
+def checked_count(what: str, value: int, expected: str = "a whole number above 0") -> int:
+    """A whole number above zero."""
+    if not is_whole(value) or not 1 <= value <= _MAX_COUNT:
+        raise FactorError(what, described(value), expected)
+    return int(value)
+
+
+_MAX_COUNT = 2**31 - 1
+"""gtsam counts rows and dimensions with ints of 32 bits."""
+
+
+def is_whole(value: Any) -> bool:
+    """Whether ``value`` is of an integer type; True and False are not."""
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
+
+
+def _is_finite(value: Any) -> bool:
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value.item()
+    if not isinstance(value, int | float | np.integer | np.floating) or isinstance(value, bool):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an int past all floats
+        return False
 
 
 def described(value: Any) -> str:
     """A short word on a value of any type, for messages."""
     if isinstance(value, np.ndarray):
         return f"an array of shape {value.shape}"
-    if value is None or isinstance(value, bool | int | float | np.number):
-        return repr(value)
+    if isinstance(value, int) and abs(value) >= 10**_MAX_DIGITS:
+        return f"an int of more than {_MAX_DIGITS} digits"
+    if value is None or isinstance(value, bool | int | float | np.number | np.bool_):
+        return str(value)
+    if isinstance(value, str):
+        return f"the text {value[:_MAX_TEXT]!r}"
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
     name = type(value).__name__
-    return f"a {name} of {len(value)}" if isinstance(value, list | tuple) else f"a {name}"
+    article = "an" if name[0] in "AEIOaeio" else "a"
+    return f"{article} {name} of {len(value)}" if isinstance(value, list | tuple) else f"{article} {name}"
+
+
+_MAX_DIGITS, _MAX_TEXT = 40, 40
+"""Of what a message repeats."""

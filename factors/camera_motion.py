@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from .arguments import checked_positive
+from .arguments import checked_number, checked_positive, checked_type
 from .custom.factor import custom_factor
 from .custom.variables import (
     Argument,
@@ -68,6 +68,8 @@ class Between:
         if self.X_a == self.X_b:
             raise FactorError("keys of Between", f"{key_name(self.X_a)} for X_a and X_b", "distinct keys")
         object.__setattr__(self, "seconds", checked_positive("seconds between the poses", self.seconds))
+        image_after_a_s = checked_number("image_after_a_s of Between", self.image_after_a_s)
+        object.__setattr__(self, "image_after_a_s", image_after_a_s)
         _ = self.lTb  # checked
 
     @cached_property
@@ -109,6 +111,9 @@ def camera_motion_factor(
     Raises:
         FactorError: one key for two variables, or another place of the LiDAR in the body at each image.
     """
+    for name, where in (("first", first), ("second", second)):
+        checked_type(f"{name} of {_NAME}", where, Between, "a sst_graph.factors.Between")
+    checked_type(f"camera_motion of {_NAME}", camera_motion, CameraMotion, "a sst_graph.factors.CameraMotion")
     if not first.lTb.equals(second.lTb, 1e-9):
         raise FactorError(f"bTl of {_NAME}", "one at the first image, another at the second", "one for both")
     error_of, noise = camera_motion_error(camera_motion)

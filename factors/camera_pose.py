@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .arguments import checked_covariance
+from .arguments import checked_covariance, checked_gtsam
 from .custom.factor import custom_factor
 
 FloatArray = NDArray[np.float64]
@@ -26,7 +26,11 @@ def camera_pose_factor(E_b: int, E_c: int, cTb: gtsam.Pose3, covariance: ArrayLi
         E_b, E_c: extrinsics bTl and cTl.
         cTb: measured pose of camera b in camera c: p_c = cTb . p_b.
         covariance: (6, 6) of it [rot, trans], right perturbation, so along the axes of b.
+
+    Raises:
+        FactorError: no keys, no pose, no covariance.
     """
+    checked_gtsam("cTb of camera_pose_factor", cTb, gtsam.Pose3)
     noise = gtsam.noiseModel.Gaussian.Covariance(
         checked_covariance("covariance of the camera's pose", covariance, 6)
     )

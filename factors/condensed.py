@@ -10,6 +10,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from .arguments import as_numbers, checked_array, checked_number, described
+from .errors import FactorError
+
 FloatArray = NDArray[np.float64]
 
 
@@ -48,12 +51,25 @@ def condense(G: FloatArray, constant: float = 0.0) -> tuple[FloatArray, FloatArr
     Returns:
         r (cols + 2,) and J (cols + 2, cols) with ``|r|^2 = G[-1, -1] + constant``,
         ``J^T r = G[:-1, -1]`` and ``J^T J = G[:-1, :-1]``; the last row has a zero Jacobian.
+
+    Raises:
+        FactorError: no square matrix of finite numbers, or a constant that is no number from 0 on.
     """
+    G = as_numbers("Gram matrix", G, "(m, m)")
+    size = max(len(G), 1) if G.ndim else 1
+    G = checked_array("Gram matrix", G, (size, size))
+    if checked_number("constant of condense", constant) < 0.0:
+        raise FactorError("constant of condense", described(constant), "a number from 0 on")
+    return condense_gram(G, constant)
+
+
+def condense_gram(G: FloatArray, constant: float) -> tuple[FloatArray, FloatArray]:
+    """:func:`condense` of arguments that were made here."""
     return condense_root(square_root(G), constant)
 
 
 def condense_root(R: FloatArray, constant: float = 0.0) -> tuple[FloatArray, FloatArray]:
-    """As :func:`condense`, from a root R (k, cols + 1), R^T R = G, of no more than cols + 1 rows."""
+    """As :func:`condense_gram`, from a root R (k, cols + 1), R^T R = G, of no more than cols + 1 rows."""
     k, m = R.shape
     J, error = np.zeros((m + 1, m - 1)), np.zeros(m + 1)
     J[:k], error[:k], error[m] = R[:, :-1], R[:, -1], np.sqrt(max(constant, 0.0))

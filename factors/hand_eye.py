@@ -21,7 +21,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .arguments import checked_array, checked_covariance, checked_number, described
+from .arguments import checked_array, checked_covariance, checked_gtsam, checked_number, checked_type
 from .custom.factor import ResidualFunction, custom_factor
 from .custom.variables import Kind, Vector
 from .errors import FactorError
@@ -30,6 +30,8 @@ FloatArray = NDArray[np.float64]
 
 MotionError = Callable[[gtsam.Pose3, bool], tuple[FloatArray, FloatArray | None]]
 """Of a predicted motion of the camera: error (6,) and derivative (6, 6) by its right perturbation."""
+
+_A_LIDAR_MOTION = "a sst_graph.factors.LidarMotion"
 
 LOW_TRANSLATION_M = 0.02
 """Below this length [m] of the predicted translation its direction is known less and less well."""
@@ -55,7 +57,7 @@ class CameraMotion:
     scale_known: bool = True
 
     def __post_init__(self) -> None:
-        _require("c1Tc2 of CameraMotion", self.c1Tc2, gtsam.Pose3)
+        checked_gtsam("c1Tc2 of CameraMotion", self.c1Tc2, gtsam.Pose3)
         covariance = checked_covariance("covariance of CameraMotion", self.covariance, 6)
         object.__setattr__(self, "covariance", covariance)
         if not self.scale_known and not np.any(self.c1Tc2.translation()):
@@ -81,7 +83,7 @@ class LidarMotion:
     time_offset_0_s: float
 
     def __post_init__(self) -> None:
-        _require("l1Tl2 of LidarMotion", self.l1Tl2, gtsam.Pose3)
+        checked_gtsam("l1Tl2 of LidarMotion", self.l1Tl2, gtsam.Pose3)
         for name in ("l_twist_1", "l_twist_2"):
             object.__setattr__(self, name, checked_array(f"{name} of LidarMotion", getattr(self, name), (6,)))
         time_offset_0_s = checked_number("time_offset_0_s of LidarMotion", self.time_offset_0_s)
@@ -98,7 +100,7 @@ class LidarMotion:
             l_omega_1, l_omega_2: (3,) its rate at both ends, in the LiDAR's frame [rad/s].
             time_offset_0_s: as of the class [s].
         """
-        _require("l1Rl2 of LidarMotion", l1Rl2, gtsam.Rot3)
+        checked_gtsam("l1Rl2 of LidarMotion", l1Rl2, gtsam.Rot3)
         twists = [
             np.concatenate([checked_array("l_omega of LidarMotion", w, (3,)), np.zeros(3)])
             for w in (l_omega_1, l_omega_2)
@@ -142,7 +144,14 @@ def hand_eye_factor(
         camera_motion: its covariance is that of the error: both motions' together, that of the LiDAR carried
             to the camera.
         lidar_motion: over the same interval.
+
+    Raises:
+        FactorError: no keys, or motions that are none.
     """
+    checked_type(
+        "camera_motion of hand_eye_factor", camera_motion, CameraMotion, "a sst_graph.factors.CameraMotion"
+    )
+    checked_type("lidar_motion of hand_eye_factor", lidar_motion, LidarMotion, _A_LIDAR_MOTION)
     motion_error, noise = camera_motion_error(camera_motion)
     return _factor("hand_eye_factor", E, D, partial(_hand_eye, lidar_motion, motion_error), noise, 6)
 
@@ -168,7 +177,12 @@ def rotation_hand_eye(
         c1Rc2: measured rotation of the camera at 2 in the camera at 1.
         lidar_motion: only its rotation counts; see :meth:`LidarMotion.of_turn`.
         covariance: (3, 3) of the error, both motions' together [rad^2].
+
+    Raises:
+        FactorError: no keys, no rotation, no motion, no covariance.
     """
+    checked_gtsam("c1Rc2 of rotation_hand_eye", c1Rc2, gtsam.Rot3)
+    checked_type("lidar_motion of rotation_hand_eye", lidar_motion, LidarMotion, _A_LIDAR_MOTION)
     noise = gtsam.noiseModel.Gaussian.Covariance(
         checked_covariance("covariance of the rotation", covariance, 3)
     )
@@ -193,11 +207,6 @@ def _factor(
     kinds: list[Kind] = [gtsam.Pose3, Vector(1)]
     keys = {"E": E} if D is None else {"E": E, "D": D}
     return custom_factor(noise, keys, function, kinds[: len(keys)], rows, name)
-
-
-def _require(what: str, value: Any, kind: type) -> None:
-    if not isinstance(value, kind):
-        raise FactorError(what, described(value), f"a gtsam.{kind.__name__}")
 
 
 def camera_motion_error(measured: CameraMotion) -> tuple[MotionError, gtsam.noiseModel.Base]:

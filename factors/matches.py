@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .arguments import checked_array
+from .arguments import as_numbers, checked_array, checked_number_or_array, checked_type, described
 from .camera import PinholeCamera
 from .errors import FactorError
-from .motion import MotionModel
+from .motion import MotionModel, checked_model
 from .robust import RobustKernel
 
 FloatArray = NDArray[np.float64]
@@ -62,12 +61,15 @@ class Alignment:
 
     def __post_init__(self) -> None:
         store = object.__setattr__
+        checked_type("camera of an alignment", self.camera, PinholeCamera, "sst_graph.factors.PinholeCamera")
+        checked_type("kernel of an alignment", self.kernel, RobustKernel, "sst_graph.factors.RobustKernel")
         store(self, "lPs", checked_array("lPs of an alignment", self.lPs, (None, 3)))
         n = len(self.lPs)
         for name in ("base_taus_s", "sigmas_px", "weights"):
-            value = np.asarray(getattr(self, name), dtype=np.float64)
-            value = np.full(n, value) if value.ndim == 0 else value
-            store(self, name, checked_array(f"{name} of an alignment", value, (n,)))
+            what = f"{name} of an alignment"
+            value = checked_number_or_array(what, getattr(self, name), (n,))
+            value = np.full(n, value) if isinstance(value, float) else value
+            store(self, name, checked_array(what, value, (n,)))
         store(self, "pixels", checked_array("pixels of an alignment", self.pixels, (n, 2)))
         if (self.sigmas_px <= 0.0).any():
             raise FactorError("sigmas_px of an alignment", f"{self.sigmas_px.min():.3g}", "values above 0")
@@ -86,11 +88,11 @@ class Alignment:
             if self.normals is None or (stretches <= 0.0).any():
                 found = "no normals" if self.normals is None else f"{stretches.min():.3g}"
                 raise FactorError("stretches of an alignment", found, "normals, and values above 0")
-        shape = (n, 6) if np.ndim(self.c_acceleration) == 2 else (6,)
-        acceleration = checked_array("c_acceleration of an alignment", self.c_acceleration, shape)
+        acceleration = as_numbers("c_acceleration of an alignment", self.c_acceleration, "(6,) or (n, 6)")
+        shape = (n, 6) if acceleration.ndim == 2 else (6,)
+        acceleration = checked_array("c_acceleration of an alignment", acceleration, shape)
         store(self, "c_acceleration", acceleration)
-        if self.motion_model not in get_args(MotionModel):
-            raise FactorError("motion model", repr(self.motion_model), " or ".join(get_args(MotionModel)))
+        checked_model(self.motion_model)
         if (np.asarray(self.weights) <= 0.0).any():
             raise FactorError("weights of an alignment", f"{np.min(self.weights):.3g}", "values above 0")
 
@@ -98,9 +100,17 @@ class Alignment:
         return len(self.lPs)
 
     def take(self, index: NDArray[np.intp]) -> Alignment:
-        """Some of the matches, by position."""
+        """Some of the matches, by position.
+
+        Raises:
+            FactorError: positions that are none.
+        """
         each = self.c_acceleration
-        return self._some(index, each if each.ndim == 1 else each[index])
+        try:
+            return self._some(index, each if each.ndim == 1 else each[index])
+        except IndexError:
+            expected = f"positions of some of {len(self)} matches"
+            raise FactorError("index of take", described(index), expected) from None
 
     def of_one_image(self, index: slice | NDArray[np.intp], c_acceleration: FloatArray) -> Alignment:
         """Some of the matches of many images, which belong to one.

@@ -26,11 +26,21 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
+
+from .arguments import (
+    as_numbers,
+    checked_array,
+    checked_gtsam,
+    checked_number_or_array,
+    checked_type,
+    described,
+)
+from .errors import FactorError
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -39,6 +49,12 @@ MotionModel = Literal["se3", "translation"]
 _TERMS = 10
 _SERIES_LIMIT = 1.0
 """Below this squared angle [rad^2] the power series (exact to 1e-16) replaces the closed forms."""
+
+
+def checked_model(model: Any) -> None:
+    """Nothing, where it is one of :data:`MotionModel`."""
+    if not isinstance(model, str) or model not in get_args(MotionModel):
+        raise FactorError("motion model", described(model), " or ".join(get_args(MotionModel)))
 
 
 def write_cross(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
@@ -128,10 +144,21 @@ class CameraTwist:
     Attributes:
         c_twist: (6,), or (6, n) where the points belong to several images [rad/s, m/s].
         c_acceleration: (6,) or (6, n) its rate of change [rad/s^2, m/s^2].
+
+    Raises:
+        FactorError: numbers of another shape.
     """
 
     c_twist: FloatArray
     c_acceleration: FloatArray
+
+    def __post_init__(self) -> None:
+        for name in ("c_twist", "c_acceleration"):
+            rows = as_numbers(f"{name} of CameraTwist", getattr(self, name), "(6,) or (6, n)")
+            # (g, 6) inside the package: see move_groups
+            if rows.ndim not in (1, 2) or 6 not in rows.shape:
+                raise FactorError(f"{name} of CameraTwist", f"shape {rows.shape}", "shape (6,) or (6, n)")
+            object.__setattr__(self, name, rows)
 
 
 @dataclass(frozen=True)
@@ -294,7 +321,33 @@ def move_points(
         model: see :data:`MotionModel`.
         l_velocities: (3, n) velocity u over ground of the object that each point lies on, in the LiDAR frame
             [m/s]; None where all are static.
+
+    Raises:
+        FactorError: no pose, no such motion, or numbers of another shape, NaN or inf.
     """
+    checked_gtsam("cTl of move_points", cTl, gtsam.Pose3)
+    lPs = checked_array("lPs of move_points", lPs, (3, None))
+    n = lPs.shape[1]
+    checked_type("motion of move_points", motion, CameraTwist, "sst_graph.factors.CameraTwist")
+    checked_model(model)
+    for name in ("c_twist", "c_acceleration"):
+        what, rows = f"{name} of move_points", getattr(motion, name)
+        checked_array(what, rows, (6,) if rows.ndim == 1 else (6, n))
+    taus_s = checked_number_or_array("taus_s of move_points", taus_s, (n,))
+    if l_velocities is not None:
+        l_velocities = checked_array("l_velocities of move_points", l_velocities, (3, n))
+    return moved_points(cTl, lPs, taus_s, motion, model, l_velocities)
+
+
+def moved_points(
+    cTl: gtsam.Pose3,
+    lPs: FloatArray,
+    taus_s: FloatArray | float,
+    motion: CameraTwist,
+    model: MotionModel,
+    l_velocities: FloatArray | None,
+) -> RigidlyMoved | PointwiseMoved:
+    """:func:`move_points` of arguments that were checked already."""
     c_twist, c_acceleration = motion.c_twist, motion.c_acceleration
     one_motion = c_twist.ndim == 1 and c_acceleration.ndim == 1
     if l_velocities is not None or not one_motion:

@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .alignment import FrameResidual, GroupedBias, Quantities, frame_residual, image_factor
-from .arguments import described
+from .arguments import checked_type
 from .camera_motion import Between
-from .condensed import condense
+from .condensed import condense_gram
 from .custom.variables import Argument, Variables, Vector, number_or_key, pose_or_key
 from .errors import FactorError
 from .matches import Alignment
@@ -69,8 +69,9 @@ def pose_alignment_factor(
         FactorError: keys that make no factor, or several accelerations; see also
             :func:`sst_graph.factors.frame_factor`.
     """
-    if noise is not None and not isinstance(noise, gtsam.noiseModel.Base):
-        raise FactorError(f"noise of {_NAME}", described(noise), "a gtsam.noiseModel of dimension 1, or None")
+    checked_type(f"between of {_NAME}", between, Between, "a sst_graph.factors.Between")
+    expected = "a gtsam.noiseModel of dimension 1, or None"
+    checked_type(f"noise of {_NAME}", noise, (gtsam.noiseModel.Base, type(None)), expected)
     if noise is not None and noise.dim() != 1:
         raise FactorError(f"noise of {_NAME}", f"dimension {noise.dim()}", "dimension 1, for the whole image")
     E, D = pose_or_key(_NAME, "cTl", cTl), number_or_key(_NAME, "time_offset_s", time_offset_s)
@@ -123,7 +124,7 @@ class _PoseFrame:
         G, constant = self.inner.gram(self.inner_values(values))
         lift = np.zeros((len(G), self.variables.cols + 1))
         lift[:-1, :-1], lift[-1, -1] = self.lift(values), 1.0
-        return condense(lift.T @ G @ lift, constant)
+        return condense_gram(lift.T @ G @ lift, constant)
 
     def stacked(self, values: Sequence[Any]) -> tuple[FloatArray, FloatArray]:
         error, J = self.inner.stacked(self.inner_values(values))

@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from .arguments import checked_array, checked_positive
+from .arguments import checked_gtsam, checked_number, checked_positive
 from .custom.factor import custom_factor
 from .custom.variables import checked_key, checked_keys
 
@@ -26,11 +26,11 @@ def time_offset_prior(
 ) -> gtsam.PriorFactorVector | gtsam.PriorFactorDouble:
     """D - time_offset_s with sigma_s [s]; ``double``: D is kept as a ``double``."""
     key = checked_key("time_offset_prior", "D_key", D_key)
-    prior = checked_array("time_offset_s", [time_offset_s], (1,))
+    prior = checked_number("time_offset_s", time_offset_s)
     noise = gtsam.noiseModel.Isotropic.Sigma(1, checked_positive("sigma_s", sigma_s))
     if double:
-        return gtsam.PriorFactorDouble(key, float(prior[0]), noise)
-    return gtsam.PriorFactorVector(key, prior, noise)
+        return gtsam.PriorFactorDouble(key, prior, noise)
+    return gtsam.PriorFactorVector(key, np.array([prior]), noise)
 
 
 def time_offset_drift(
@@ -90,6 +90,7 @@ def beta_regularizer(
     Returns:
         A factor whose error is [Log(R R_static^-1) (rad), t - t_static (m)], sigmas lambda^-1/2.
     """
+    checked_gtsam("cTl_static of beta_regularizer", cTl_static, gtsam.Pose3)
     R_static, t_static = cTl_static.rotation(), cTl_static.translation()
     weights = (checked_positive("lambda_r", lambda_r), checked_positive("lambda_t", lambda_t))
     sigmas = np.repeat([weight**-0.5 for weight in weights], 3)

@@ -21,11 +21,19 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from .arguments import (
+    as_numbers,
+    checked_array,
+    checked_gtsam,
+    checked_number,
+    checked_number_or_array,
+    checked_type,
+)
 from .camera import MIN_DEPTH_M
 from .condensed import gram, square_root
 from .errors import FactorError
 from .matches import Alignment
-from .motion import CameraTwist, GroupsMoved, PointwiseMoved, RigidlyMoved, move_points
+from .motion import CameraTwist, GroupsMoved, PointwiseMoved, RigidlyMoved, moved_points
 
 FloatArray = NDArray[np.float64]
 
@@ -72,7 +80,12 @@ def residuals(
     Returns:
         r (rows,): first all u, then all v (or one row a match); J (rows, 13 [+1]) with columns [rot,
         trans, offset, twist (6), bias] [px/rad, px/m, px/s, ...]. Rows of points behind are zero.
+
+    Raises:
+        FactorError: no alignment, no pose, numbers of another shape, NaN or inf, a bias of point-to-pixel
+            matches.
     """
+    time_offset_s, c_twist, bias_px = _checked(alignment, cTl, time_offset_s, c_twist, bias_px)
     evaluated = evaluate(alignment, cTl, time_offset_s, c_twist, bias_px, jacobians)
     if not jacobians:
         return evaluated.rows[-1].reshape(-1), None
@@ -92,7 +105,11 @@ def weighted_residuals(
     Returns:
         r and J as :func:`residuals` gives them, each row multiplied by sqrt(weight w_i) / sigma_i, and
         the constant c = 2 cost - |r|^2 >= 0 that makes ``(|r|^2 + c) / 2`` the robust cost.
+
+    Raises:
+        FactorError: as :func:`residuals`.
     """
+    time_offset_s, c_twist, bias_px = _checked(alignment, cTl, time_offset_s, c_twist, bias_px)
     evaluated = evaluate(alignment, cTl, time_offset_s, c_twist, bias_px, jacobians=True)
     constant = weigh(alignment, evaluated)
     system = evaluated.system()
@@ -106,8 +123,31 @@ def alignment_cost(
     c_twist: FloatArray,
     bias_px: float | FloatArray | None = None,
 ) -> float:
-    """Robust cost: sum weight_i rho(|r_i| / sigma_i), with points behind as the module says."""
+    """Robust cost: sum weight_i rho(|r_i| / sigma_i), with points behind as the module says.
+
+    Raises:
+        FactorError: as :func:`residuals`.
+    """
+    time_offset_s, c_twist, bias_px = _checked(alignment, cTl, time_offset_s, c_twist, bias_px)
     return cost(alignment, evaluate(alignment, cTl, time_offset_s, c_twist, bias_px, jacobians=False))
+
+
+def _checked(
+    alignment: Alignment,
+    cTl: gtsam.Pose3,
+    time_offset_s: float,
+    c_twist: FloatArray,
+    bias_px: float | FloatArray | None,
+) -> tuple[float, FloatArray, float | FloatArray | None]:
+    """Offset, twist and bias as :func:`residuals` takes them; the other two are looked at."""
+    checked_type("alignment", alignment, Alignment, "sst_graph.factors.Alignment")
+    checked_gtsam("cTl", cTl, gtsam.Pose3)
+    n = len(alignment)
+    twist = as_numbers("c_twist", c_twist, "(6,) or (6, n)")
+    twist = checked_array("c_twist", twist, (6, n) if twist.ndim == 2 else (6,))
+    if bias_px is not None:
+        bias_px = checked_number_or_array("bias_px", bias_px, (n,))
+    return checked_number("time_offset_s", time_offset_s), twist, bias_px
 
 
 @dataclass(frozen=True)
@@ -190,7 +230,7 @@ def evaluate(
     twist = np.asarray(c_twist, dtype=np.float64)
     motion = CameraTwist(twist, alignment.c_acceleration.T)
     taus_s, lPs = alignment.taus_s(float(time_offset_s)), alignment.columns[0]
-    moved = move_points(cTl, lPs, taus_s, motion, alignment.motion_model, alignment.velocity_columns)
+    moved = moved_points(cTl, lPs, taus_s, motion, alignment.motion_model, alignment.velocity_columns)
     return evaluate_moved(alignment, moved, bias_px, jacobians)
 
 

@@ -8,7 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .arguments import checked_positive
+from .arguments import as_numbers, checked_positive, described
 from .errors import FactorError
 
 FloatArray = NDArray[np.float64]
@@ -31,17 +31,19 @@ class RobustKernel:
     scale: float = field(default=1.0, metadata={"at_least": 0.01, "at_most": 1e6})
 
     def __post_init__(self) -> None:
-        if self.kind not in get_args(KernelKind):
-            raise FactorError("robust kernel", repr(self.kind), "one of " + ", ".join(get_args(KernelKind)))
+        if not isinstance(self.kind, str) or self.kind not in get_args(KernelKind):
+            raise FactorError(
+                "robust kernel", described(self.kind), "one of " + ", ".join(get_args(KernelKind))
+            )
         checked_positive("scale of the robust kernel", self.scale)
 
     def weight(self, x: ArrayLike) -> FloatArray:
         """w = rho'(x) / x, in [0, 1]; any shape."""
-        return self.weight_and_loss(np.square(np.asarray(x, dtype=np.float64)))[0]
+        return self.weight_and_loss(np.square(as_numbers("x", x)))[0]
 
     def loss(self, x: ArrayLike) -> FloatArray:
         """rho(x), any shape."""
-        return self.weight_and_loss(np.square(np.asarray(x, dtype=np.float64)))[1]
+        return self.weight_and_loss(np.square(as_numbers("x", x)))[1]
 
     def weight_and_loss(self, squares: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Both from x^2, any shape: a linearization wants both, and most of their work is the same."""
@@ -63,7 +65,7 @@ class RobustKernel:
 
     def curvature(self, x: ArrayLike) -> FloatArray:
         """rho''(x), any shape: negative where a kernel redescends."""
-        x = np.asarray(x, dtype=np.float64)
+        x = as_numbers("x", x)
         if self.kind == "none":
             return np.ones_like(x)
         if self.kind == "huber":

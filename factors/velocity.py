@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .arguments import checked_array, checked_covariance, checked_number, checked_positive
+from .arguments import checked_array, checked_covariance, checked_number, checked_positive, checked_type
 from .custom.factor import custom_factor
 from .custom.variables import Kind, Vector, checked_key, checked_keys
 from .errors import FactorError
@@ -78,6 +78,8 @@ def velocity_direction_factor(
         sigmas: of the three.
         low_speed_mps: s [m/s].
     """
+    name = "sigmas of velocity_direction_factor"
+    checked_type(name, sigmas, DirectionSigmas, "a sst_graph.factors.DirectionSigmas")
     measured_omega = checked_array("omega", omega, (3,))
     d = checked_array("direction", direction, (3,))
     length = float(np.linalg.norm(d))
@@ -232,7 +234,12 @@ def twist_transfer_factor(
         D_key: time offset.
         lidar_twist: of the LiDAR at the image's instant.
         covariance: (6, 6) of its twist, expressed in the camera frame.
+
+    Raises:
+        FactorError: no keys, no twist, no covariance.
     """
+    name = "lidar_twist of twist_transfer_factor"
+    checked_type(name, lidar_twist, LidarTwist, "a sst_graph.factors.LidarTwist")
     noise = gtsam.noiseModel.Gaussian.Covariance(checked_covariance("covariance of the twist", covariance, 6))
     keys = {"V_key": V_key, "E_key": E_key, "D_key": D_key}
     kinds: list[Kind] = [Vector(6), gtsam.Pose3, Vector(1)]

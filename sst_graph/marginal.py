@@ -20,6 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError, EstimationError
+from sst_graph.factors.arguments import checked_type
+from sst_graph.factors.custom.variables import checked_keys
 from sst_graph.files.json_table import JsonTable, json_table
 from sst_graph.files.reading import MARGINAL, parse_json, read_text
 from sst_graph.types import ByValue, Calibration
@@ -58,7 +60,12 @@ class CalibrationMarginal(ByValue):
     constant: float = 0.0
 
     def factor(self, E_key: int = EXTRINSIC, D_key: int = TIME_OFFSET) -> gtsam.LinearContainerFactor:
-        """The cost as a factor on the given keys; it pickles and serializes, and needs gtsam only."""
+        """The cost as a factor on the given keys; it pickles and serializes, and needs gtsam only.
+
+        Raises:
+            FactorError: no keys, or one for both.
+        """
+        E_key, D_key = _checked_keys(E_key, D_key)
         L, g = self.information, self.vector
         hessian = gtsam.HessianFactor(
             E_key, D_key, L[:6, :6], L[:6, 6:], g[:6], L[6:, 6:], g[6:], self.constant
@@ -66,7 +73,12 @@ class CalibrationMarginal(ByValue):
         return gtsam.LinearContainerFactor(hessian, self.point(E_key, D_key))
 
     def point(self, E_key: int = EXTRINSIC, D_key: int = TIME_OFFSET) -> gtsam.Values:
-        """The linearization point as values."""
+        """The linearization point as values.
+
+        Raises:
+            FactorError: no keys, or one for both.
+        """
+        E_key, D_key = _checked_keys(E_key, D_key)
         values = gtsam.Values()
         values.insert(E_key, self.cTl)
         values.insert(D_key, np.array([self.time_offset_s]))
@@ -90,7 +102,12 @@ class CalibrationMarginal(ByValue):
         return Calibration(self.cTl.retract(d[:6]), self.time_offset_s + float(d[6]))
 
     def plus(self, other: CalibrationMarginal) -> CalibrationMarginal:
-        """Both costs together, at this one's linearization point; exact where the two share it."""
+        """Both costs together, at this one's linearization point; exact where the two share it.
+
+        Raises:
+            FactorError: something else than a marginal.
+        """
+        checked_type("a marginal plus another", other, CalibrationMarginal, "a CalibrationMarginal")
         there = other if self.shares_point(other) else carried(other, self.cTl, self.time_offset_s)
         return replace(
             self,
@@ -104,7 +121,12 @@ class CalibrationMarginal(ByValue):
         return self.time_offset_s == other.time_offset_s and self.cTl.equals(other.cTl, 0.0)
 
     def to_json(self, E_key: int = EXTRINSIC, D_key: int = TIME_OFFSET) -> str:
-        """The marginal as documented in docs/reference/marginal.md."""
+        """The marginal as documented in docs/reference/marginal.md.
+
+        Raises:
+            FactorError: no keys, or one for both.
+        """
+        E_key, D_key = _checked_keys(E_key, D_key)
         document = {
             "format": FORMAT,
             "version": VERSION,
@@ -141,6 +163,11 @@ class CalibrationMarginal(ByValue):
             _bounded(table, "vector", table.matrix("vector", (7,))),
             float(_bounded(table, "constant", np.array(table.number("constant")))),
         )
+
+
+def _checked_keys(E_key: Any, D_key: Any) -> tuple[int, int]:
+    E, D = checked_keys("a marginal", {"E_key": E_key, "D_key": D_key})
+    return E, D
 
 
 def read_marginal(path: str | Path) -> CalibrationMarginal:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.files.checked_values import check_covariance, check_finite, checked_camera, checked_text
+from sst_graph.files.checked_values import check_covariance, check_finite, checked_text, pinhole_camera
 from sst_graph.files.json_table import JsonTable, json_table
 from sst_graph.files.reading import CALIBRATION, parse_json, read_text
 from sst_graph.files.strict_json import strict_json
@@ -257,8 +257,7 @@ def _check_status(status: str) -> None:
 
 def _camera(table: JsonTable) -> PinholeCamera:
     fx, fy, cx, cy = (table.number(key) for key in ("fx", "fy", "cx", "cy"))
-    camera = PinholeCamera(fx, fy, cx, cy, table.integer("width"), table.integer("height"))
-    return checked_camera(camera, table.place)
+    return pinhole_camera((fx, fy, cx, cy), (table.integer("width"), table.integer("height")), table.place)
 
 
 def _weak_direction(table: JsonTable) -> WeakDirection:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.files.checked_values import checked_camera, checked_pose, checked_time_offset_s
+from sst_graph.files.checked_values import checked_pose, checked_time_offset_s, pinhole_camera
 from sst_graph.types import NO_PICTURE, CameraImage, Frame, PixelStretch, Scan, SemanticClass
 
 MOST_POINTS = 10_000_000
@@ -119,16 +119,12 @@ def checked_intrinsics(camera: object, place: str = "camera") -> PinholeCamera:
     """A camera of plain numbers that go with the size of its image.
 
     Raises:
-        DataError: something else, or as :func:`sst_graph.files.checked_values.checked_camera`.
+        DataError: something else, or as :func:`sst_graph.files.checked_values.pinhole_camera`.
     """
     if not isinstance(camera, PinholeCamera):
         raise DataError(place, f"a {type(camera).__name__}", "a PinholeCamera")
-    for name in ("width", "height"):
-        side = getattr(camera, name)
-        if not isinstance(side, int | np.integer) or isinstance(side, bool):
-            raise DataError(f"{place}: {name}", f"a {type(side).__name__}", "a whole number of pixels")
-    fx, fy, cx, cy = (_number(getattr(camera, name), f"{place}: {name}") for name in ("fx", "fy", "cx", "cy"))
-    return checked_camera(PinholeCamera(fx, fy, cx, cy, int(camera.width), int(camera.height)), place)
+    intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
+    return pinhole_camera(intrinsics, (int(camera.width), int(camera.height)), place)
 
 
 def checked_guess(initial: object, time_offset_s: object) -> tuple[gtsam.Pose3 | None, float]:

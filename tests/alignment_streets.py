@@ -168,7 +168,7 @@ def _street(
     scans, images = [], []
     for frame in frames:
         assert frame.scan is not None and frame.image is not None
-        scan, image = features_of(frame.scan, frame.image, classes)
+        scan, image = features_of(frame.scan, frame.image, classes, drive.camera)
         scans.append(scan)
         images.append(image)
     rng, stamps = np.random.default_rng(seed), [scan.stamp_ns for scan in scans]

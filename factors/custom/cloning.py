@@ -14,6 +14,7 @@ from typing import Any
 
 import gtsam
 
+from ..arguments import checked_type
 from ..errors import FactorError
 from .factor import FactorRecipe, recipe_of
 from .variables import checked_key
@@ -23,15 +24,21 @@ def clone_factor(factor: gtsam.NonlinearFactor) -> gtsam.NonlinearFactor:
     """A factor that shares nothing with this one: gtsam's own clone, or one built again from its recipe.
 
     Raises:
-        FactorError: a ``CustomFactor`` that another made.
+        FactorError: a ``CustomFactor`` that another made, or no factor.
     """
+    _checked_factor("factor of clone_factor", factor)
     if not isinstance(factor, gtsam.CustomFactor):
         return factor.clone()
     return copy.deepcopy(own_recipe(factor)).build()
 
 
 def clone_graph(graph: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
-    """What ``graph.clone()`` is where all factors can; empty slots stay empty."""
+    """What ``graph.clone()`` is where all factors can; empty slots stay empty.
+
+    Raises:
+        FactorError: it holds a ``CustomFactor`` that another made, or is no graph.
+    """
+    checked_graph("graph of clone_graph", graph)
     cloned = gtsam.NonlinearFactorGraph()
     cloned.resize(graph.size())
     for i in range(graph.size()):
@@ -46,12 +53,18 @@ def rekeyed(factor: gtsam.NonlinearFactor, new_keys: Mapping[int, int]) -> gtsam
     A condensed factor looks its variables up by position, so only its keys change.
 
     Raises:
-        FactorError: two variables on one key, or a ``CustomFactor`` that another made.
+        FactorError: no keys, two variables on one key, or a ``CustomFactor`` that another made.
     """
+    _checked_factor("factor of rekeyed", factor)
+    checked_type("new_keys of rekeyed", new_keys, Mapping, "a dict from old keys to new ones")
+    new = {
+        checked_key("rekeyed", "new_keys", old): checked_key("rekeyed", "new_keys", key)
+        for old, key in new_keys.items()
+    }
     if not isinstance(factor, gtsam.CustomFactor):
-        return factor.rekey([new_keys.get(int(key), int(key)) for key in list(factor.keys())])
+        return factor.rekey([new.get(int(key), int(key)) for key in list(factor.keys())])
     recipe = own_recipe(factor)
-    keys = [checked_key("rekeyed", "new_keys", new_keys.get(key, key)) for key in recipe.keys]
+    keys = [new.get(key, key) for key in recipe.keys]
     if len(set(keys)) != len(keys):
         raise FactorError("new_keys of rekeyed", "one key for two variables", "distinct keys")
     return replace(recipe, keys=dict(zip(keys, recipe.keys.values(), strict=True))).build()
@@ -64,17 +77,28 @@ class PackedGraph:
 
     Attributes:
         factors: by slot; None where it is empty.
+
+    Raises:
+        FactorError: something else than factors and recipes.
     """
 
     factors: tuple[FactorRecipe | Any | None, ...]
+
+    def __post_init__(self) -> None:
+        checked_type("factors of PackedGraph", self.factors, tuple, "a tuple, as PackedGraph.of makes it")
+        expected = "a FactorRecipe, a factor of a gtsam graph, or None"
+        for each in self.factors:
+            kinds = (FactorRecipe, gtsam.NonlinearFactor, type(None))
+            checked_type("factors of PackedGraph", each, kinds, expected)
 
     @staticmethod
     def of(graph: gtsam.NonlinearFactorGraph) -> PackedGraph:
         """Pack a graph.
 
         Raises:
-            FactorError: it holds a ``CustomFactor`` that another made.
+            FactorError: it holds a ``CustomFactor`` that another made, or is no graph.
         """
+        checked_graph("graph of PackedGraph", graph)
         slots = [graph.at(i) if graph.exists(i) else None for i in range(graph.size())]
         return PackedGraph(
             tuple(own_recipe(each) if isinstance(each, gtsam.CustomFactor) else each for each in slots)
@@ -88,6 +112,15 @@ class PackedGraph:
             if each is not None:
                 graph.replace(i, each.build() if isinstance(each, FactorRecipe) else each)
         return graph
+
+
+def checked_graph(what: str, graph: Any) -> None:
+    """Nothing, where it is a graph of nonlinear factors."""
+    checked_type(what, graph, gtsam.NonlinearFactorGraph, "a gtsam.NonlinearFactorGraph")
+
+
+def _checked_factor(what: str, factor: Any) -> None:
+    checked_type(what, factor, gtsam.NonlinearFactor, "a factor of a gtsam graph")
 
 
 def own_recipe(factor: gtsam.CustomFactor) -> FactorRecipe:

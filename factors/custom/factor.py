@@ -19,9 +19,9 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arguments import described
+from ..arguments import checked_count, checked_type, described
 from ..errors import FactorError
-from .variables import Kind, Reader, checked_keys, dimension, key_name
+from .variables import Kind, Reader, checked_key, checked_keys, dimension, key_name
 
 FloatArray = NDArray[np.float64]
 Jacobians = Sequence[FloatArray] | None
@@ -37,6 +37,9 @@ class FactorRecipe:
 
     Attributes:
         keys: with the name of the argument that each came as ('' where it has none).
+
+    Raises:
+        FactorError: attributes that disagree or are of another kind.
     """
 
     noise: gtsam.noiseModel.Base
@@ -45,6 +48,26 @@ class FactorRecipe:
     dims: tuple[Kind, ...]
     rows: int
     name: str
+
+    def __post_init__(self) -> None:
+        name = self.name
+        checked_type("name of a factor", name, str, "a str")
+        checked_type(f"keys of {name}", self.keys, dict, "a dict of keys, with a name for each")
+        for key in self.keys:
+            checked_key(name, "keys", key)
+        checked_type(f"dims of {name}", self.dims, tuple, "one dimension or kind for each key")
+        if len(self.dims) != len(self.keys):
+            expected = f"{len(self.keys)}, one for each key"
+            raise FactorError(f"dims of {name}", f"{len(self.dims)} dims", expected)
+        for kind in self.dims:
+            dimension(kind)
+        checked_count(f"rows of {name}", self.rows)
+        checked_type(f"noise of {name}", self.noise, gtsam.noiseModel.Base, "a gtsam.noiseModel")
+        if self.noise.dim() != self.rows:
+            found = f"dimension {self.noise.dim()}"
+            raise FactorError(f"noise of {name}", found, f"dimension {self.rows} (rows)")
+        if not callable(self.function):
+            raise FactorError(f"function of {name}", described(self.function), "a function")
 
     def build(self) -> gtsam.CustomFactor:
         """A new factor."""
@@ -85,7 +108,11 @@ def recipe_of(factor: gtsam.NonlinearFactor) -> FactorRecipe | None:
 
     gtsam has no accessor for the callback of a ``CustomFactor``, so the callback is called and hands out its
     recipe. That of a ``CustomFactor`` made elsewhere is called on empty values, and may raise or not.
+
+    Raises:
+        FactorError: no factor.
     """
+    checked_type("factor of recipe_of", factor, gtsam.NonlinearFactor, "a factor of a gtsam graph")
     if not isinstance(factor, gtsam.CustomFactor):
         return None
     found: list[FactorRecipe] = []
@@ -128,14 +155,10 @@ def custom_factor(
             kind, a wrong shape, a missing Jacobian, NaN or inf (ISAM2 cannot go on after that: linearize
             first).
     """
+    checked_type("name of a factor", name, str, "a str")
     named = checked_keys(name, keys)
-    if len(dims) != len(named):
-        raise FactorError(f"dims of {name}", f"{len(dims)} dims", f"{len(named)}, one for each key")
-    if not isinstance(noise, gtsam.noiseModel.Base):
-        raise FactorError(f"noise of {name}", described(noise), "a gtsam.noiseModel")
-    if noise.dim() != rows:
-        raise FactorError(f"noise of {name}", f"dimension {noise.dim()}", f"dimension {rows} (rows)")
-    return FactorRecipe(noise, named, function, tuple(dims), int(rows), name).build()
+    kinds = tuple(dims) if isinstance(dims, list) else dims
+    return FactorRecipe(noise, named, function, kinds, rows, name).build()  # type: ignore[arg-type]  # checked
 
 
 def _checked(

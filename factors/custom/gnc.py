@@ -12,9 +12,10 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arguments import checked_positive, described
+from ..arguments import checked_number, checked_positive, checked_type, described, is_whole
 from ..errors import FactorError
-from .cloning import own_recipe
+from .cloning import checked_graph, own_recipe
+from .variables import checked_values
 
 FloatArray = NDArray[np.float64]
 
@@ -40,13 +41,15 @@ class GncParams:
     weights_tolerance: float = 1e-3
 
     def __post_init__(self) -> None:
-        if not 1.0 < self.mu_step < 1e6:
+        if not callable(self.inlier_cost):
+            checked_positive("inlier_cost", self.inlier_cost)
+        if not 1.0 < checked_number("mu_step", self.mu_step) < 1e6:
             raise FactorError("mu_step", described(self.mu_step), "above 1 and below 1e6")
-        if not (isinstance(self.max_iterations, int) and 1 <= self.max_iterations <= 100_000):
+        if not (is_whole(self.max_iterations) and 1 <= self.max_iterations <= 100_000):
             raise FactorError(
                 "max_iterations", described(self.max_iterations), "a whole number up to 100,000"
             )
-        if not 0.0 < self.weights_tolerance < 0.5:
+        if not 0.0 < checked_number("weights_tolerance", self.weights_tolerance) < 0.5:
             raise FactorError("weights_tolerance", described(self.weights_tolerance), "above 0 and below 0.5")
 
 
@@ -86,8 +89,17 @@ def gnc(
         known_inliers: positions of factors that keep the weight 1.
 
     Raises:
-        FactorError: a factor that cannot be weighted.
+        FactorError: a factor that cannot be weighted, no value for one of its keys, or no graph.
     """
+    checked_graph("graph of gnc", graph)
+    checked_values("values of gnc", values, [graph.at(i) for i in range(graph.size()) if graph.exists(i)])
+    checked_type("config of gnc", config, GncParams, "a sst_graph.factors.GncParams")
+    expected = "positions of factors, as a list or a set"
+    checked_type("known_inliers of gnc", known_inliers, (list, tuple, set, frozenset, range), expected)
+    for position in known_inliers:
+        if not is_whole(position) or not 0 <= position < graph.size():
+            expected = f"positions from 0 to {graph.size() - 1}"
+            raise FactorError("known_inliers of gnc", described(position), expected)
     slots = [i for i in range(graph.size()) if graph.exists(i)]
     weighted = [i for i in slots if i not in set(known_inliers)]
     limits = np.array([_limit(config, i) for i in weighted])

@@ -9,7 +9,9 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arguments import checked_positive, checked_type
 from ..errors import FactorError
+from .variables import checked_values
 
 FloatArray = NDArray[np.float64]
 
@@ -78,8 +80,12 @@ def check_jacobians(
         step: h, in the units of the tangent space (rad, m, s).
 
     Raises:
-        FactorError: an error above the tolerance; the message names variable, row and column.
+        FactorError: an error above the tolerance, the message names variable, row and column; no such factor,
+            or no value for one of its keys.
     """
+    expected = "a gtsam.NoiseModelFactor, a CustomFactor for instance"
+    checked_type("factor of check_jacobians", factor, gtsam.NoiseModelFactor, expected)
+    _check(factor, values, tolerance, step)
     A, _ = factor.linearize(values).jacobian()
     numerical = _numerical(factor, values, factor.whitenedError, step)
     return _report("Jacobian", np.asarray(A), numerical, tolerance)
@@ -93,6 +99,9 @@ def check_gradient(
     Holds for every factor whose linearization is true to its cost: plain, condensed, robustly weighted.
     Arguments and errors as in :func:`check_jacobians`.
     """
+    expected = "a factor of a gtsam graph"
+    checked_type("factor of check_gradient", factor, gtsam.NonlinearFactor, expected)
+    _check(factor, values, tolerance, step)
     A, b = factor.linearize(values).jacobian()
     gradient = -(np.asarray(A).T @ np.asarray(b))[None, :]
 
@@ -100,6 +109,12 @@ def check_gradient(
         return np.array([factor.error(x)])
 
     return _report("gradient", gradient, _numerical(factor, values, cost, step), tolerance)
+
+
+def _check(factor: gtsam.NonlinearFactor, values: gtsam.Values, tolerance: float, step: float) -> None:
+    checked_values("values of the comparison", values, [factor])
+    checked_positive("tolerance", tolerance)
+    checked_positive("step", step)
 
 
 def _numerical(

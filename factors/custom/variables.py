@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arguments import described
+from ..arguments import as_numbers, checked_count, checked_gtsam, checked_type, described, is_whole
 from ..errors import FactorError
 
 FloatArray = NDArray[np.float64]
@@ -31,9 +31,16 @@ _FIRST_SYMBOL = 2**56
 
 @dataclass(frozen=True)
 class Vector:
-    """Kind of a variable that is a vector of ``size`` numbers; of size 1 also a ``double``."""
+    """Kind of a variable that is a vector of ``size`` numbers; of size 1 also a ``double``.
+
+    Raises:
+        FactorError: a size that is no whole number above 0.
+    """
 
     size: int
+
+    def __post_init__(self) -> None:
+        checked_count("size of Vector", self.size)
 
 
 Kind = int | type | Vector
@@ -48,10 +55,10 @@ def checked_key(factor: str, argument: str, value: Any) -> int:
     """
     if isinstance(value, gtsam.Symbol | gtsam.LabeledSymbol):
         return int(value.key())
-    if not isinstance(value, int | np.integer) or isinstance(value, bool | np.bool_):
+    if not is_whole(value):
         raise FactorError(f"{argument} of {factor}", described(value), _A_KEY)
     if not 0 <= int(value) < _KEYS:
-        raise FactorError(f"{argument} of {factor}", f"{value}", f"{_A_KEY} from 0 to 2^64 - 1")
+        raise FactorError(f"{argument} of {factor}", described(value), f"{_A_KEY} from 0 to 2^64 - 1")
     return int(value)
 
 
@@ -66,6 +73,7 @@ def is_key(value: Any) -> bool:
 def pose_or_key(factor: str, argument: str, value: Any) -> int | gtsam.Pose3:
     """A fixed pose, or the key of one."""
     if isinstance(value, gtsam.Pose3):
+        checked_gtsam(f"{argument} of {factor}", value, gtsam.Pose3)
         return value
     if is_key(value):
         return checked_key(factor, argument, value)
@@ -77,6 +85,7 @@ def body_in_lidar(factor: str, bTl: Any) -> gtsam.Pose3:
     if bTl is None:
         return gtsam.Pose3()
     if isinstance(bTl, gtsam.Pose3):
+        checked_gtsam(f"bTl of {factor}", bTl, gtsam.Pose3)
         return bTl.inverse()
     raise FactorError(f"bTl of {factor}", described(bTl), "a gtsam.Pose3, or None")
 
@@ -95,17 +104,34 @@ def number_or_key(factor: str, argument: str, value: Any) -> int | float:
             )
         return key
     try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
+        array = as_numbers(argument, value)
+    except FactorError:
         array = np.zeros(0)
-    if value is None or array.shape not in ((), (1,)) or not np.isfinite(array).all():
+    if array.shape not in ((), (1,)) or not np.isfinite(array).all():
         raise FactorError(f"{argument} of {factor}", described(value), f"a finite float, or {_A_KEY}")
     return float(array.item())
 
 
+def checked_values(
+    what: str, values: Any, factors: Iterable[gtsam.NonlinearFactor], further: Iterable[int] = ()
+) -> None:
+    """Nothing, where ``values`` has one for each key of the factors, and for the further keys."""
+    checked_type(what, values, gtsam.Values, "a gtsam.Values")
+    for key in sorted({*further, *(int(key) for factor in factors for key in list(factor.keys()))}):
+        if not values.exists(key):
+            raise FactorError(what, f"no {key_name(key)}", "a value for each key of the graph")
+
+
 def checked_keys(factor: str, keys: Sequence[Any] | Mapping[str, Any]) -> dict[int, str]:
     """Distinct keys of a factor, with the name of the argument that each came as ('' where it has none)."""
-    named = keys.items() if isinstance(keys, Mapping) else [("", key) for key in keys]
+    if isinstance(keys, Mapping):
+        named = list(keys.items())
+    elif isinstance(keys, Iterable) and not isinstance(keys, str):
+        named = [("", key) for key in keys]
+    else:
+        raise FactorError(
+            f"keys of {factor}", described(keys), "a list of keys, or a dict with a name for each"
+        )
     found: dict[int, str] = {}
     for name, value in named:
         key = checked_key(factor, name or "keys", value)
@@ -123,7 +149,6 @@ def key_name(key: int) -> str:
     return str(gtsam.DefaultKeyFormatter(key))
 
 
-@cache
 def dimension(kind: Kind) -> int:
     """Tangent dimension of a kind.
 
@@ -133,16 +158,19 @@ def dimension(kind: Kind) -> int:
     if isinstance(kind, Vector):
         return kind.size
     if isinstance(kind, type):
-        try:
-            size = _tangent_dimension(kind())
-        except TypeError:
-            size = 0
-        if size == 0:
-            raise FactorError("kind of a variable", kind.__name__, "a class that gtsam.Values holds")
-        return size
-    if isinstance(kind, bool) or not isinstance(kind, int | np.integer) or kind < 1:
-        raise FactorError("kind of a variable", described(kind), "a dimension above 0, a class, or Vector(n)")
-    return int(kind)
+        return _class_dimension(kind)
+    return checked_count("kind of a variable", kind, "a dimension above 0, a class, or Vector(n)")
+
+
+@cache
+def _class_dimension(kind: type) -> int:
+    try:
+        size = _tangent_dimension(kind())
+    except Exception:  # of any class that a caller may give
+        size = 0
+    if size == 0:
+        raise FactorError("kind of a variable", kind.__name__, "a class that gtsam.Values holds")
+    return size
 
 
 def _tangent_dimension(value: Any) -> int:

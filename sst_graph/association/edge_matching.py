@@ -23,7 +23,7 @@ from sst_graph.assumptions.model import Effect, Scene
 from sst_graph.config import Settings, internal, setting
 from sst_graph.factors.alignment import Alignment
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.factors.motion import CameraTwist, group_poses, move_points, transformed
+from sst_graph.factors.motion import CameraTwist, group_poses, moved_points, transformed
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.features.lidar_edges import Boundaries, Edge, joined
 from sst_graph.features.mask_contour import ContourFeet, ContourMap, nearest_contours, stretches
@@ -192,7 +192,7 @@ class PairedEdges:
             poses = self.poses(cTl, time_offset_s)
         if poses is None:
             each = CameraTwist(*(self.repeated(rows).T for rows in self.motion_rows))
-            return np.asarray(move_points(cTl, columns, taus, each).cPs.T)
+            return np.asarray(moved_points(cTl, columns, taus, each, "se3", None).cPs.T)
         return transformed(poses, columns, self.bounds).T
 
     def poses(self, cTl: gtsam.Pose3, time_offset_s: float) -> FloatArray | None:

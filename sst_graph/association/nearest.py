@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
-from sst_graph.factors import Alignment, CameraTwist, MotionModel, PinholeCamera, move_points
+from sst_graph.factors import Alignment, CameraTwist, MotionModel, PinholeCamera
+from sst_graph.factors.motion import moved_points
 
 FloatArray = NDArray[np.float64]
 
@@ -144,7 +145,7 @@ def match_nearest(
     """
     tau_s = time_offset_s + view.base_tau_s
     motion = CameraTwist(c_twist, np.zeros(6))
-    cPs = move_points(cTl, view.lPs.T, tau_s, motion, _MOTION_MODEL).cPs.T
+    cPs = moved_points(cTl, view.lPs.T, tau_s, motion, _MOTION_MODEL, None).cPs.T
     uvs = view.camera.project(cPs)
     on_image = np.flatnonzero(view.camera.in_front(cPs) & view.camera.in_image(uvs))
     if len(on_image) == 0:

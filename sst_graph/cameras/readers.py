@@ -20,7 +20,7 @@ from sst_graph.cameras.fisheye import FisheyeCamera
 from sst_graph.cameras.model import CameraModel
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.files.checked_values import checked_camera, checked_pose
+from sst_graph.files.checked_values import checked_camera, checked_pose, pinhole_camera
 
 FloatArray = NDArray[np.float64]
 Table = Mapping[str, Any]
@@ -154,13 +154,13 @@ def _kalibr_camera(table: Table, place: str) -> KalibrCamera:
         names = "[xi, alpha, fu, fv, pu, pv]" if own else "[fu, fv, pu, pv]"
         raise DataError(place, f"{len(values)} intrinsics of {kind}", names)
     fx, fy, cx, cy = (float(value) for value in values[own:])
-    intrinsics = PinholeCamera(fx, fy, cx, cy, width, height)
+    intrinsics = pinhole_camera((fx, fy, cx, cy), (width, height), place)
     model: CameraModel
     if kind == "ds":
         if distortion != "none" or coefficients.any():
             raise DataError(place, f"ds with the distortion '{distortion}'", "none")
         try:
-            model = DoubleSphereCamera(checked_camera(intrinsics, place), float(values[0]), float(values[1]))
+            model = DoubleSphereCamera(intrinsics, float(values[0]), float(values[1]))
         except ConfigError as error:
             raise DataError(place, str(error), "a double sphere") from None
     elif distortion not in ("none", "radtan", "equidistant"):
@@ -305,4 +305,4 @@ def _pinhole(K: FloatArray, width: int, height: int, place: str) -> PinholeCamer
     if skewed or not np.allclose(K[2], [0.0, 0.0, 1.0], atol=1e-9):
         raise DataError(place, f"{K.tolist()}", "[fx 0 cx; 0 fy cy; 0 0 1]")
     fx, fy, cx, cy = (float(K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    return checked_camera(PinholeCamera(fx, fy, cx, cy, width, height), place)
+    return pinhole_camera((fx, fy, cx, cy), (width, height), place)

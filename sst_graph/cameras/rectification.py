@@ -17,7 +17,7 @@ from scipy import ndimage
 from sst_graph.cameras.model import BoolArray, CameraModel, FloatArray
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.files.checked_values import checked_camera
+from sst_graph.files.checked_values import pinhole_camera
 from sst_graph.types import CameraImage, PixelStretch, SemanticClass
 
 FIELD_OF_VIEW_DEG = 110.0
@@ -61,8 +61,8 @@ def rectified_camera(model: CameraModel, field_of_view_deg: float = FIELD_OF_VIE
     if min(width, height) < _LEAST_SIDE_PX:
         found = f"a field of {width}x{height} px around the optical axis"
         raise DataError(f"camera ({model.name})", found, f"at least {_LEAST_SIDE_PX} px a side")
-    camera = PinholeCamera(float(fx), float(fy), -fx * left, -fy * top, width, height)
-    return checked_camera(camera, f"camera rectified from {model.name}")
+    intrinsics = (float(fx), float(fy), -fx * left, -fy * top)
+    return pinhole_camera(intrinsics, (width, height), f"camera rectified from {model.name}")
 
 
 def _slopes(model: CameraModel, uvs: FloatArray, axis: int, limit: float) -> tuple[float, float]:

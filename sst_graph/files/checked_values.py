@@ -113,27 +113,39 @@ def checked_camera(camera: PinholeCamera, place: str | Path) -> PinholeCamera:
     """A camera whose intrinsics go with the size of its image.
 
     Raises:
+        DataError: as :func:`pinhole_camera`.
+    """
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+    return pinhole_camera(intrinsics, (camera.width, camera.height), place)
+
+
+def pinhole_camera(
+    intrinsics: tuple[float, float, float, float], size: tuple[int, int], place: str | Path
+) -> PinholeCamera:
+    """The camera of fx, fy, cx, cy and of width, height [px], which go together.
+
+    Raises:
         DataError: a size without pixels, a focal length that is none (FOCAL_LENGTHS, MAX_PIXEL_ASPECT), or a
             principal point farther from the image than the image is large.
     """
-    width, height = camera.width, camera.height
+    (fx, fy, cx, cy), (width, height) = intrinsics, size
     if not (0 < width <= MAX_IMAGE_SIDE_PX and 0 < height <= MAX_IMAGE_SIDE_PX):
         raise DataError(place, f"an image of {width}x{height} px", f"1 to {MAX_IMAGE_SIDE_PX} px a side")
     least, most = (share * max(width, height) for share in FOCAL_LENGTHS)
-    for name, focal in (("fx", camera.fx), ("fy", camera.fy)):
+    for name, focal in (("fx", fx), ("fy", fy)):
         if not least <= focal <= most:
             expected = f"a focal length of {least:.4g} to {most:.4g} px for an image of {width}x{height} px"
             raise DataError(place, f"{name} = {focal:.6g} px", expected)
-    if not 1.0 / MAX_PIXEL_ASPECT <= camera.fx / camera.fy <= MAX_PIXEL_ASPECT:
-        found = f"fx = {camera.fx:.6g} and fy = {camera.fy:.6g} px"
+    if not 1.0 / MAX_PIXEL_ASPECT <= fx / fy <= MAX_PIXEL_ASPECT:
+        found = f"fx = {fx:.6g} and fy = {fy:.6g} px"
         raise DataError(
             place, found, f"focal lengths that differ by a factor of at most {MAX_PIXEL_ASPECT:g}"
         )
-    for name, centre, side in (("cx", camera.cx, width), ("cy", camera.cy, height)):
+    for name, centre, side in (("cx", cx, width), ("cy", cy, height)):
         if not -side <= centre <= 2 * side:
             expected = f"a principal point of {-side} to {2 * side} px for an image of {width}x{height} px"
             raise DataError(place, f"{name} = {centre:.6g} px", expected)
-    return camera
+    return PinholeCamera(fx, fy, cx, cy, width, height)
 
 
 def checked_text(text: str, place: str) -> str:

@@ -13,7 +13,7 @@ from sst_graph.assumptions import ASSUMPTIONS, Effect, combined
 from sst_graph.assumptions.model import Scene
 from sst_graph.drive.trajectory import TwistSamples
 from sst_graph.factors.alignment import Alignment, residuals
-from sst_graph.factors.motion import CameraTwist, move_points
+from sst_graph.factors.motion import CameraTwist, moved_points
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -134,5 +134,5 @@ def _pixels(alignment: Alignment, cTl: gtsam.Pose3, time_offset_s: float, c_twis
     velocities = alignment.velocity_columns
     taus = alignment.taus_s(time_offset_s)
     motion = CameraTwist(c_twist, alignment.c_acceleration.T)
-    moved = move_points(cTl, lPs, taus, motion, alignment.motion_model, velocities)
+    moved = moved_points(cTl, lPs, taus, motion, alignment.motion_model, velocities)
     return alignment.camera.project(moved.cPs.T)

@@ -15,6 +15,9 @@ from sst_graph.files.reading import CALIBRATION, FileKind, parse_json, read_text
 from sst_graph.files.yaml_file import YAML, parse_yaml
 
 ANY = FileKind("a calibration in a format of docs/how-to/imports.md", CALIBRATION.max_bytes)
+TREE = FileKind(
+    "the vehicle's transforms as URDF, a launch file, tf messages or Autoware's", CALIBRATION.max_bytes
+)
 
 _MOST_CHARACTERS = {"XML": 4 << 20, "Python": 64 << 10, "YAML": YAML.max_bytes}
 
@@ -93,13 +96,13 @@ class Document:
             raise DataError(self.path, f"{language} of {len(self.text)} characters", f"at most {most}")
 
 
-def read_document(path: Path) -> Document:
-    """A file's text.
+def read_document(path: Path, kind: FileKind = ANY) -> Document:
+    """A file's text; ``kind`` is for errors.
 
     Raises:
         DataError: missing, unreadable, too large or no UTF-8.
     """
-    return Document(path, read_text(path, ANY))
+    return Document(path, read_text(path, kind))
 
 
 def _yaml_parts(text: str) -> list[str]:

@@ -13,7 +13,7 @@ from sst_graph.data.kitti.calib import read_calibration
 from sst_graph.data.ros.transforms import Transforms
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.imports import chains, launch, records, tables, urdf
-from sst_graph.imports.document import Document, read_document
+from sst_graph.imports.document import TREE, Document, read_document
 from sst_graph.imports.frames import Found, ImportOptions, extrinsic_between, stated_time_offset_s
 from sst_graph.marginal import FORMAT as MARGINAL_FORMAT
 from sst_graph.types import ByValue
@@ -74,7 +74,7 @@ def read_tree(path: Path) -> Transforms:
         DataError: a file of another kind, or one without transforms.
         MissingDependencyError: a YAML file, and PyYAML is not installed.
     """
-    document = read_document(path)
+    document = read_document(path, TREE)
     form = recognized(document)
     if form not in _TREES:
         raise DataError(path, f"a file of the format {form}", f"one of {', '.join(_TREES)}")

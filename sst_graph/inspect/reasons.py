@@ -37,6 +37,11 @@ def short_reason(reason: str) -> str:
     return f"{what}: {_cut(remedy, MOST_LETTERS - len(what) - 2)}"
 
 
+def as_sentence(reason: str) -> str:
+    """A short reason with its full stop; one that was cut ends as it is."""
+    return reason if reason.endswith("…") else f"{reason}."
+
+
 def _cut(text: str, most: int) -> str:
     """The text, ended at a word where it is longer."""
     if len(text) <= most:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.fit import CLOSE_PX, FitQuality
-from sst_graph.inspect.reasons import short_reasons
+from sst_graph.inspect.reasons import as_sentence, short_reasons
 from sst_graph.result import CalibrationResult
 
 FloatArray = NDArray[np.float64]
@@ -60,10 +60,10 @@ def verdict(result: CalibrationResult) -> str:
     """
     if result.status == "not_converged":
         first = next(iter(short_reasons(result)), "the estimate contradicts the data")
-        return f"Do not use this calibration: {first}."
+        return f"Do not use this calibration: {as_sentence(first)}"
     if result.status == "unobservable":
         first = next(iter(short_reasons(result)), "the data leave a direction open")
-        return f"Not finished: {first}. As it is: {_known(result)}"
+        return f"Not finished: {as_sentence(first)} As it is: {_known(result)}"
     return f"Good to {_known(result)}"
 
 

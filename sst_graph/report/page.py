@@ -15,7 +15,7 @@ from sst_graph.fit import CLOSE_PX, Fit, FitQuality, MatchedFrame
 from sst_graph.inspect.budget_text import budget_lines
 from sst_graph.inspect.inspection import Inspection, inspect_result, strong_correlations
 from sst_graph.inspect.inspection_text import MOST_SENTENCES, advice_sentences, correlation_sentence
-from sst_graph.inspect.reasons import short_reasons
+from sst_graph.inspect.reasons import as_sentence, short_reasons
 from sst_graph.inspect.report import Comparison, error_lines, summary
 from sst_graph.inspect.verdict import DRIVING_MPS, figure, misfits, quality_line, verdict
 from sst_graph.report.close_ups import ZOOM, close_ups
@@ -133,14 +133,17 @@ def _next(inspection: Inspection) -> str:
     result = inspection.result
     weak = [f"{one.sentence}: {one.advice}." for one in result.weak_directions]
     nothing = f"No direction is past its limit. The weakest: {inspection.weakest.sentence}."
-    short = [reason[0].upper() + reason[1:] + "." for reason in short_reasons(result)]
+    short = [as_sentence(reason[0].upper() + reason[1:]) for reason in short_reasons(result)]
     advice = [] if inspection.plan is None else advice_sentences(inspection, inspection.plan)
     return section(
         "next",
         "What is weak, and what to record next",
         bullets(short) if short else paragraph(nothing),
         details("The reasons in full", bullets([*result.reasons, *weak])) if result.reasons else "",
-        paragraph("What to record next, by the information that the frames of this record gave:")
+        paragraph(
+            "What to record next, by the information that the frames of this record gave "
+            "(standard deviations, now -> then):"
+        )
         if advice
         else "",
         bullets(one[0].upper() + one[1:] + "." for one in advice),

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import ConfigError
+from sst_graph.factors.arguments import checked_gtsam, checked_number, checked_type
 from sst_graph.types import ByValue
 
 FloatArray = NDArray[np.float64]
@@ -28,6 +29,10 @@ class KnownPose(ByValue):
         camera, reference: names; p_camera = T_camera_reference . p_reference.
         T_camera_reference: the pose.
         rotation_sigma_deg, translation_sigma_m: its deviation along each axis.
+
+    Raises:
+        ConfigError: one camera for both, or a sigma that is none.
+        FactorError: no names, no pose.
     """
 
     camera: str
@@ -37,10 +42,13 @@ class KnownPose(ByValue):
     translation_sigma_m: float = TRANSLATION_SIGMA_M
 
     def __post_init__(self) -> None:
+        for name in ("camera", "reference"):
+            checked_type(f"{name} of KnownPose", getattr(self, name), str, "the name of a camera")
+        checked_gtsam("T_camera_reference of KnownPose", self.T_camera_reference, gtsam.Pose3)
         if self.camera == self.reference:
             raise ConfigError(f"known pose of {self.camera!r}: found in itself, expected in another camera")
         for name in ("rotation_sigma_deg", "translation_sigma_m"):
-            value = getattr(self, name)
+            value = checked_number(f"{name} of KnownPose", getattr(self, name))
             if not 1e-9 <= value <= 1e3:
                 raise ConfigError(
                     f"known pose of {self.camera!r}: {name}: found {value!r}, expected 1e-9 to 1e3"
@@ -60,10 +68,19 @@ class KnownRig:
     Attributes:
         poses: of cameras in one another; those that join several of them are independent.
         one_trigger: all cameras have one time offset, to :data:`TRIGGER_SIGMA_S`.
+
+    Raises:
+        FactorError: something else than poses.
     """
 
     poses: tuple[KnownPose, ...] = ()
     one_trigger: bool = False
+
+    def __post_init__(self) -> None:
+        checked_type("poses of KnownRig", self.poses, (list, tuple), "a tuple of KnownPose")
+        for pose in self.poses:
+            checked_type("poses of KnownRig", pose, KnownPose, "a KnownPose")
+        checked_type("one_trigger of KnownRig", self.one_trigger, bool, "True or False")
 
     def check(self, cameras: Sequence[str]) -> None:
         """Refuse poses of other cameras.

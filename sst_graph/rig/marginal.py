@@ -11,6 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import ConfigError
+from sst_graph.factors import FactorError
+from sst_graph.factors.arguments import checked_type, described
+from sst_graph.factors.custom.variables import checked_keys
 from sst_graph.graph.linear import information_inverse
 from sst_graph.graph.state import time_offset_key
 from sst_graph.rig.influences import UNKNOWNS
@@ -64,9 +67,24 @@ class RigMarginal(ByValue):
         """Default keys of extrinsic and time offset by the camera's name: (E0, D0), (E1, D1), ..."""
         return {name: rig_keys(number) for number, name in enumerate(self.names)}
 
+    def _checked(self, keys: Mapping[str, tuple[int, int]] | None) -> dict[str, tuple[int, int]]:
+        """Keys of all cameras."""
+        if keys is None:
+            return self.keys()
+        what, expected = "keys of a rig's marginal", f"keys (E, D) of each of {', '.join(self.names)}"
+        checked_type(what, keys, Mapping, f"a dict with {expected}")
+        named = {}
+        for name in self.names:
+            pair = keys.get(name)
+            if not (isinstance(pair, tuple | list) and len(pair) == 2):
+                raise FactorError(what, f"{described(pair)} for {name}", expected)
+            named |= {f"E of {name}": pair[0], f"D of {name}": pair[1]}
+        found = iter(checked_keys("a rig's marginal", named))
+        return {name: (next(found), next(found)) for name in self.names}
+
     def point(self, keys: Mapping[str, tuple[int, int]] | None = None) -> gtsam.Values:
-        """The estimate as values."""
-        values, keys = gtsam.Values(), self.keys() if keys is None else keys
+        """The estimate as values; arguments and errors as of :meth:`factor`."""
+        values, keys = gtsam.Values(), self._checked(keys)
         for name, cTl, time_offset_s in zip(self.names, self.extrinsics, self.time_offsets_s, strict=True):
             E, D = keys[name]
             values.insert(E, cTl)
@@ -78,8 +96,11 @@ class RigMarginal(ByValue):
 
         Args:
             keys: of extrinsic and time offset, by the camera's name; by default :meth:`keys`.
+
+        Raises:
+            FactorError: no such pair for a camera, or one key for two variables.
         """
-        keys = self.keys() if keys is None else keys
+        keys = self._checked(keys)
         information = information_inverse(self.covariance)
         variables: list[tuple[int, slice]] = []
         for i, name in enumerate(self.names):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sst_graph.association.edge_matching import (
@@ -16,6 +16,7 @@ from sst_graph.association.edge_matching import (
     SilhouetteMatches,
     match_silhouettes,
 )
+from sst_graph.config import expect_settings
 from sst_graph.drive.preparation import (
     ImageFeatures,
     PrepareConfig,
@@ -24,7 +25,15 @@ from sst_graph.drive.preparation import (
     scan_features,
 )
 from sst_graph.errors import DataError
+from sst_graph.factors import FactorError
 from sst_graph.factors.alignment import Alignment
+from sst_graph.factors.arguments import (
+    checked_array,
+    checked_gtsam,
+    checked_number,
+    checked_type,
+    described,
+)
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.factors.motion import CameraTwist
 from sst_graph.factors.robust import RobustKernel
@@ -32,6 +41,7 @@ from sst_graph.features.lidar_edges import Boundaries
 from sst_graph.objects.occupancy import ObjectName
 from sst_graph.objects.velocity import velocities_of_points
 from sst_graph.types import CameraImage, Scan, SemanticClass
+from sst_graph.validation import checked_image, checked_scan, checked_stamp
 
 FloatArray = NDArray[np.float64]
 
@@ -79,12 +89,27 @@ class CameraCalibration:
         cTl: extrinsic.
         time_offset_s: time offset [s].
         biases_px: mask bias by class [px]; 0 where one is missing.
+
+    Raises:
+        FactorError: no camera, no pose, no numbers.
     """
 
     camera: PinholeCamera
     cTl: gtsam.Pose3
     time_offset_s: float
     biases_px: Mapping[SemanticClass, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        name = "of CameraCalibration"
+        checked_type(f"camera {name}", self.camera, PinholeCamera, "a PinholeCamera")
+        checked_gtsam(f"cTl {name}", self.cTl, gtsam.Pose3)
+        time_offset_s = checked_number(f"time_offset_s {name}", self.time_offset_s)
+        object.__setattr__(self, "time_offset_s", time_offset_s)
+        expected = "a dict from SemanticClass to a number"
+        checked_type(f"biases_px {name}", self.biases_px, Mapping, expected)
+        for c, bias in self.biases_px.items():
+            checked_type(f"biases_px {name}", c, SemanticClass, expected)
+            checked_number(f"biases_px {name}", bias)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +127,8 @@ class ScanMotion:
         from_ns: with ``lTs``, the LiDAR-clock stamp of the pose before the image [ns].
 
     Raises:
-        DataError: one of ``lTs`` and ``from_ns``; arrays of a wrong shape.
+        DataError: one of ``lTs`` and ``from_ns``, or no stamp.
+        FactorError: no pose, or arrays of a wrong shape.
     """
 
     l_twist: FloatArray
@@ -114,13 +140,22 @@ class ScanMotion:
     def __post_init__(self) -> None:
         if (self.lTs is None) != (self.from_ns is None):
             raise DataError("ScanMotion", "one of lTs and from_ns", "both, or none")
+        if self.lTs is not None:
+            checked_gtsam("lTs of ScanMotion", self.lTs, gtsam.Pose3)
+            object.__setattr__(self, "from_ns", checked_stamp(self.from_ns, "from_ns of ScanMotion"))
         acceleration = np.zeros(6) if self.l_acceleration is None else self.l_acceleration
-        velocities = {
-            (c, n): _finite(f"l_velocities[{c.name}, {n}]", velocity, 3)
-            for (c, n), velocity in self.l_velocities.items()
-        }
-        object.__setattr__(self, "l_twist", _finite("l_twist", self.l_twist, 6))
-        object.__setattr__(self, "l_acceleration", _finite("l_acceleration", acceleration, 6))
+        what = "l_velocities of ScanMotion"
+        expected = "a dict from (SemanticClass, number within the scan) to a velocity"
+        checked_type(what, self.l_velocities, Mapping, expected)
+        velocities = {}
+        for name, velocity in self.l_velocities.items():
+            if not (isinstance(name, tuple) and len(name) == 2 and isinstance(name[0], SemanticClass)):
+                raise FactorError(what, described(name), expected)
+            velocities[name] = checked_array(what, velocity, (3,))
+        twist = checked_array("l_twist of ScanMotion", self.l_twist, (6,))
+        acceleration = checked_array("l_acceleration of ScanMotion", acceleration, (6,))
+        object.__setattr__(self, "l_twist", twist)
+        object.__setattr__(self, "l_acceleration", acceleration)
         object.__setattr__(self, "l_velocities", velocities)
 
     def of_camera(self, cTl: gtsam.Pose3) -> CameraTwist:
@@ -142,11 +177,23 @@ class FrameMatching:
             Edges of the picture have :data:`EDGE_KERNEL_SHARE` of that scale, and :data:`EDGE_KERNEL_PX` at
             most.
         config: how boundary points meet contours.
+
+    Raises:
+        FactorError: no classes, no kernel.
+        ConfigError: no settings.
     """
 
     classes: Sequence[SemanticClass] = VEHICLES
     kernel: RobustKernel = SLAM_KERNEL
     config: MatchConfig = SLAM_MATCHES
+
+    def __post_init__(self) -> None:
+        expected = "a tuple of SemanticClass"
+        checked_type("classes of FrameMatching", self.classes, (list, tuple), expected)
+        for c in self.classes:
+            checked_type("classes of FrameMatching", c, SemanticClass, expected)
+        checked_type("kernel of FrameMatching", self.kernel, RobustKernel, "a sst_graph.factors.RobustKernel")
+        object.__setattr__(self, "config", expect_settings(self.config, MatchConfig))
 
     def matchers(self) -> list[tuple[frozenset[SemanticClass], RobustKernel, MatchConfig]]:
         """Classes that are matched alike, with their kernel and settings."""
@@ -181,8 +228,15 @@ def align_frame(
 
     Returns:
         The matches, possibly none: a frame without any gives no factor.
+
+    Raises:
+        DataError: no scan, no image, or such as have a flaw.
+        FactorError: no calibration, no motion, no matching.
     """
-    points, contours = features_of(scan, image, matching.classes)
+    checked_type("calibration of align_frame", calibration, CameraCalibration, "a CameraCalibration")
+    checked_type("motion of align_frame", motion, ScanMotion, "a ScanMotion")
+    checked_type("matching of align_frame", matching, FrameMatching, "a FrameMatching")
+    points, contours = features_of(scan, image, matching.classes, calibration.camera)
     from_ns = points.stamp_ns if motion.from_ns is None else motion.from_ns
     place = calibration.cTl if motion.lTs is None else calibration.cTl * motion.lTs
     offset_s, biases_px = calibration.time_offset_s, calibration.biases_px
@@ -203,11 +257,20 @@ def align_frame(
 
 
 def features_of(
-    scan: Scan | ScanFeatures, image: CameraImage | ImageFeatures, classes: Sequence[SemanticClass]
+    scan: Scan | ScanFeatures,
+    image: CameraImage | ImageFeatures,
+    classes: Sequence[SemanticClass],
+    camera: PinholeCamera,
 ) -> tuple[ScanFeatures, ImageFeatures]:
-    """What :func:`align_frame` needs of a scan and an image."""
+    """What :func:`align_frame` needs of a scan and an image.
+
+    Raises:
+        DataError: neither these nor their features, or such as have a flaw.
+    """
+    contours = image
+    if not isinstance(contours, ImageFeatures):
+        contours = image_features(0, checked_image(contours, camera), classes)
     points = scan_features_of(scan, classes)
-    contours = image_features(0, image, classes) if isinstance(image, CameraImage) else image
     if points.by_geometry is None:
         return points, contours
     # A scan with labels, in which objects without a class were looked for too.
@@ -217,10 +280,14 @@ def features_of(
 
 
 def scan_features_of(scan: Scan | ScanFeatures, classes: Sequence[SemanticClass]) -> ScanFeatures:
-    """What :func:`features_of` needs of a scan, whatever its image shows."""
+    """What :func:`features_of` needs of a scan, whatever its image shows.
+
+    Raises:
+        DataError: no scan, or one that has a flaw.
+    """
     if isinstance(scan, ScanFeatures):
         return scan
-    return scan_features(0, scan, classes, PrepareConfig(), depth=False, with_lower_edges=False)
+    return scan_features(0, checked_scan(scan), classes, PrepareConfig(), depth=False, with_lower_edges=False)
 
 
 def _unlabelled(
@@ -258,10 +325,3 @@ def _frame_alignments(found: Mapping[SemanticClass, SilhouetteMatches]) -> Frame
         tuple(matches.objects for matches in found.values()),
         tuple(matches.sides for matches in found.values()),
     )
-
-
-def _finite(name: str, value: ArrayLike, count: int) -> FloatArray:
-    array = np.asarray(value, dtype=np.float64)
-    if array.shape != (count,) or not np.isfinite(array).all():
-        raise DataError(f"{name} of ScanMotion", f"shape {array.shape}", f"{count} finite numbers")
-    return array

@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
-from sst_graph.factors.custom.variables import checked_key, number_or_key, pose_or_key
+from sst_graph.factors.arguments import checked_type
+from sst_graph.factors.custom.variables import body_in_lidar, checked_key, number_or_key, pose_or_key
 from sst_graph.types import SemanticClass
+from sst_graph.validation import checked_stamp
 
 FloatArray = NDArray[np.float64]
 
@@ -33,7 +35,14 @@ class Trajectory:
     """Keys and stamps of a body's poses wTb, in the order of time; poses may be added at the end."""
 
     def __init__(self, keys: Iterable[int] = (), stamps_ns: Iterable[int] = ()) -> None:
-        """keys: of Pose3 variables; stamps_ns: in the LiDAR's clock, rising [ns]."""
+        """keys: of Pose3 variables; stamps_ns: in the LiDAR's clock, rising [ns].
+
+        Raises:
+            DataError: not one rising stamp for each key.
+            FactorError: no keys, no stamps.
+        """
+        for name, given in (("keys", keys), ("stamps_ns", stamps_ns)):
+            checked_type(f"{name} of Trajectory", given, Iterable, "one for each pose, in the order of time")
         self._keys: list[int] = []
         self._stamps: list[int] = []
         keys, stamps = list(keys), list(stamps_ns)
@@ -49,13 +58,15 @@ class Trajectory:
         """Add the pose after all others.
 
         Raises:
-            DataError: a stamp that is no later than the last.
+            DataError: no stamp, or one that is no later than the last.
             FactorError: no key.
         """
+        key = checked_key("Trajectory", "key", key)
+        stamp_ns = checked_stamp(stamp_ns, "a pose")
         if self._stamps and stamp_ns <= self._stamps[-1]:
             raise DataError("stamp of a pose", f"{stamp_ns} ns", f"a stamp after {self._stamps[-1]} ns")
-        self._keys.append(checked_key("Trajectory", "key", key))
-        self._stamps.append(int(stamp_ns))
+        self._keys.append(key)
+        self._stamps.append(stamp_ns)
 
     @property
     def keys(self) -> tuple[int, ...]:
@@ -114,6 +125,9 @@ class AlignmentKeys:
         time_offset_s: key of the time offset (``Vector(1)`` or ``double``), or a fixed offset [s].
         biases_px: by class, key of its mask bias or a fixed bias [px]; none where a class is missing.
         bTl: pose of the LiDAR in the body; None where the poses are the LiDAR's own.
+
+    Raises:
+        FactorError: no trajectory, no keys, or constants that are none.
     """
 
     trajectory: Trajectory
@@ -126,6 +140,12 @@ class AlignmentKeys:
         place = "AlignmentKeys"
         object.__setattr__(self, "cTl", pose_or_key(place, "cTl", self.cTl))
         object.__setattr__(self, "time_offset_s", number_or_key(place, "time_offset_s", self.time_offset_s))
+        checked_type("trajectory of AlignmentKeys", self.trajectory, Trajectory, "a Trajectory")
+        body_in_lidar(place, self.bTl)
+        expected = "a dict from SemanticClass to a key or a number"
+        checked_type("biases_px of AlignmentKeys", self.biases_px, Mapping, expected)
+        for c in self.biases_px:
+            checked_type("biases_px of AlignmentKeys", c, SemanticClass, expected)
         biases = {c: number_or_key(place, "biases_px", bias) for c, bias in self.biases_px.items()}
         object.__setattr__(self, "biases_px", biases)
 

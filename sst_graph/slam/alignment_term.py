@@ -20,9 +20,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from sst_graph.association.edge_matching import MatchConfig
 from sst_graph.batch.by_edges.positions import position_columns
-from sst_graph.config import Settings, setting
+from sst_graph.config import Settings, expect_settings, setting
 from sst_graph.drive.preparation import ImageFeatures, ScanFeatures
 from sst_graph.errors import DataError
+from sst_graph.factors.arguments import checked_type
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.factors.camera_motion import Between
 from sst_graph.factors.pose_alignment import pose_alignment_factor
@@ -211,6 +212,11 @@ class AlignmentTerm:
         config: how to match.
         l_velocities: for each scan (3,) over ground of objects that move, in the scan's LiDAR frame [m/s], by
             class and number within the scan.
+
+    Raises:
+        DataError: no scan, no image, or such as have a flaw; not one set of velocities for each scan.
+        FactorError: no camera, no keys, no velocities.
+        ConfigError: no settings.
     """
 
     scans: Scan | ScanFeatures | Sequence[Scan | ScanFeatures]
@@ -221,10 +227,18 @@ class AlignmentTerm:
     l_velocities: Sequence[Mapping[ObjectName, FloatArray]] = ()
 
     def __post_init__(self) -> None:
-        given = [self.scans] if isinstance(self.scans, Scan | ScanFeatures) else list(self.scans)
+        checked_type("camera of AlignmentTerm", self.camera, PinholeCamera, "a PinholeCamera")
+        checked_type("keys of AlignmentTerm", self.keys, AlignmentKeys, "an AlignmentKeys")
+        object.__setattr__(self, "config", expect_settings(self.config, TermConfig))
+        given = [self.scans] if isinstance(self.scans, Scan | ScanFeatures) else self.scans
+        checked_type("scans of AlignmentTerm", given, (list, tuple), "a Scan, or a list of them")
         if not given:
             raise DataError("AlignmentTerm", "no scan", "one scan or more")
-        features = [features_of(scan, self.image, self.config.classes) for scan in given]
+        features = [features_of(scan, self.image, self.config.classes, self.camera) for scan in given]
+        expected = "a list with a dict for each scan, from (SemanticClass, number) to a velocity"
+        checked_type("l_velocities of AlignmentTerm", self.l_velocities, (list, tuple), expected)
+        for own in self.l_velocities:
+            checked_type("l_velocities of AlignmentTerm", own, Mapping, expected)
         velocities = tuple(self.l_velocities) or ({},) * len(given)
         if len(velocities) != len(given):
             raise DataError(

@@ -34,10 +34,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.batch.by_edges.covariance import FLOOR
+from sst_graph.config import expect_settings
 from sst_graph.covariance.error_model import ErrorModel, SideResiduals, fit_error_model
 from sst_graph.covariance.observability import limits_of_unknowns, weak_directions
 from sst_graph.covariance.sums import ScoreSums
 from sst_graph.errors import EstimationError
+from sst_graph.factors.arguments import checked_type
+from sst_graph.factors.custom.variables import checked_values
 from sst_graph.graph.linear import covariance_root
 from sst_graph.result import WeakDirection
 from sst_graph.slam.alignment_keys import COLUMNS, POSITIONS, AlignmentKeys, bias_column
@@ -100,8 +103,18 @@ def calibration_covariance(
 
     Raises:
         EstimationError: no match has a factor, or the graph does not determine extrinsic and offset.
+        FactorError: no graph, no matches, or no value for a key.
+        ConfigError: no settings.
     """
-    config = config or RematchConfig()
+    config = expect_settings(config, RematchConfig)
+    where = "calibration_covariance"
+    checked_type(f"graph of {where}", graph, gtsam.NonlinearFactorGraph, "a NonlinearFactorGraph")
+    factors = [graph.at(i) for i in range(graph.size()) if graph.exists(i)]
+    checked_values(f"values of {where}", values, factors)
+    expected = "a list of TermMatches, as AlignmentTerm.matched gives them"
+    checked_type(f"matches of {where}", matches, (list, tuple), expected)
+    for each in matches:
+        checked_type(f"matches of {where}", each, TermMatches, expected)
     used = [each for each in matches if each.factor is not None and each.term is not None]
     if not used or used[0].term is None:
         raise EstimationError("calibration_covariance: found no term with a factor, expected one or more")
@@ -288,7 +301,8 @@ def _held_biases(
         response = -P @ sums.claimed[:, column]  # of the variables to the bias
         follows = response.copy()
         follows[column] = 1.0
-        S = float(follows @ sums.claimed[:, column]) + MASK_BIAS_PRIOR_PX**-2
+        # 0 where the graph holds less than the matches: not theirs, or scaled down
+        S = max(float(follows @ sums.claimed[:, column]), 0.0) + MASK_BIAS_PRIOR_PX**-2
         # What the variables know beyond these matches (priors, motion) does not err with them.
         sigma = float(np.sqrt(np.maximum(follows @ variance @ follows, 0.0))) / S
         found[c] = -float(sums.gradient[column]) / S, sigma

@@ -16,6 +16,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.config import expect_settings
+from sst_graph.factors.arguments import checked_type
 from sst_graph.slam.alignment_keys import AlignmentKeys
 from sst_graph.slam.alignment_term import AlignmentTerm, TermMatches, TermState
 from sst_graph.slam.config import CALM, RematchConfig
@@ -31,7 +33,7 @@ from sst_graph.slam.covariance import (
     total,
 )
 from sst_graph.slam.object_sides import ObjectSides
-from sst_graph.slam.solving import moved_px, proximal, widest_px
+from sst_graph.slam.solving import checked_terms, moved_px, proximal, widest_px
 from sst_graph.slam.term_warnings import TermWarning, far_from_start, last_warnings, wide_uncertainty
 
 FloatArray = NDArray[np.float64]
@@ -79,9 +81,18 @@ class IncrementalTerms:
     """The alignment terms of one camera in one solver."""
 
     def __init__(self, solver: Solver, keys: AlignmentKeys, config: RematchConfig | None = None) -> None:
-        """solver: yours; all later updates go through :meth:`update`. keys: those of the terms."""
+        """solver: yours; all later updates go through :meth:`update`. keys: those of the terms.
+
+        Raises:
+            FactorError: no solver, no keys.
+            ConfigError: no settings.
+        """
+        solvers = (gtsam.ISAM2, gtsam.IncrementalFixedLagSmoother)
+        expected = "a gtsam.ISAM2 or gtsam.IncrementalFixedLagSmoother"
+        checked_type("solver of IncrementalTerms", solver, solvers, expected)
+        checked_type("keys of IncrementalTerms", keys, AlignmentKeys, "an AlignmentKeys")
         self._solver, self._keys = solver, keys
-        self._config = config or RematchConfig()
+        self._config = expect_settings(config, RematchConfig)
         self._terms: list[_Placed] = []
         self._proximal: dict[int, gtsam.NonlinearFactor] = {}
         self._stamps: dict[int, float] = {}
@@ -104,7 +115,15 @@ class IncrementalTerms:
             graph, values: as the solver's own ``update`` takes them; the first hold extrinsic and offset.
             terms: new ones; a term whose image lies after the last pose waits for it.
             stamps: for a smoother, stamp of each variable [s]; extrinsic and offset are stamped again here.
+
+        Raises:
+            FactorError: no graph, no values, no terms, no stamps.
         """
+        where = "IncrementalTerms.update"
+        checked_type(f"graph of {where}", graph, gtsam.NonlinearFactorGraph, "a NonlinearFactorGraph")
+        checked_type(f"values of {where}", values, gtsam.Values, "a gtsam.Values")
+        checked_terms(where, terms)
+        checked_type(f"stamps of {where}", stamps, (Mapping, type(None)), "a dict from keys to seconds")
         stamps = self._stamped(stamps)
         self._solve(graph, values, stamps, self._leaving(stamps))
         self._terms += [_Placed(term) for term in terms]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sst_graph.drive.preparation import ScanFeatures
 from sst_graph.errors import DataError
+from sst_graph.factors.arguments import checked_gtsam, checked_type
 from sst_graph.objects.dynamic_objects import DynamicObjectTest
 from sst_graph.objects.occupancy import ObjectName
 from sst_graph.objects.tracks import ObjectTracker
@@ -49,8 +50,13 @@ def follow_objects(
         classes: of the terms.
 
     Raises:
-        DataError: not one pose for each scan.
+        DataError: not one pose for each scan; no scan, or one that has a flaw.
+        FactorError: no scans, no poses.
     """
+    for name, given in (("scans", scans), ("wTls", wTls)):
+        checked_type(f"{name} of follow_objects", given, (list, tuple), "a list, one for each scan")
+    for wTl in wTls:
+        checked_gtsam("wTls of follow_objects", wTl, gtsam.Pose3)
     if len(scans) != len(wTls):
         raise DataError("follow_objects", f"{len(wTls)} poses", f"{len(scans)}, one a scan")
     tracker, test = ObjectTracker(), DynamicObjectTest()

@@ -15,12 +15,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.config import expect_settings
 from sst_graph.errors import EstimationError
+from sst_graph.factors.arguments import checked_type
+from sst_graph.factors.custom.variables import checked_values
 from sst_graph.factors.priors import time_offset_prior
 from sst_graph.slam.alignment_keys import AlignmentKeys
 from sst_graph.slam.alignment_term import AlignmentTerm, TermMatches
@@ -77,6 +81,17 @@ class RematchSolution:
     warnings: tuple[TermWarning, ...]
 
 
+def checked_terms(where: str, terms: Any) -> None:
+    """Nothing, where they are terms.
+
+    Raises:
+        FactorError: they are not.
+    """
+    checked_type(f"terms of {where}", terms, (list, tuple), "a list of AlignmentTerm")
+    for term in terms:
+        checked_type(f"terms of {where}", term, AlignmentTerm, "an AlignmentTerm")
+
+
 def solve_with_terms(
     graph: gtsam.NonlinearFactorGraph,
     values: gtsam.Values,
@@ -93,8 +108,15 @@ def solve_with_terms(
 
     Raises:
         EstimationError: no term, no match at the start, or a system that is indeterminate at the end.
+        FactorError: no graph, no terms, or no value for a key of either.
+        ConfigError: no settings.
     """
-    config = config or RematchConfig()
+    config = expect_settings(config, RematchConfig)
+    checked_type("graph of solve_with_terms", graph, gtsam.NonlinearFactorGraph, "a NonlinearFactorGraph")
+    checked_terms("solve_with_terms", terms)
+    factors = [graph.at(i) for i in range(graph.size()) if graph.exists(i)]
+    lasting = [key for term in terms for key in term.keys.lasting]
+    checked_values("values of solve_with_terms", values, factors, lasting)
     if not terms:
         raise EstimationError("solve_with_terms: found no term, expected one or more")
     keys, kernel_px, held = terms[0].keys, config.first_px, True

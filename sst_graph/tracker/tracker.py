@@ -12,6 +12,7 @@ import numpy as np
 from sst_graph.config import expect_settings
 from sst_graph.drive.stamp_intervals import Jump
 from sst_graph.errors import DataError, EstimationError
+from sst_graph.factors.arguments import checked_type
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.odometry.sweep import SweepDecision
 from sst_graph.result import UNNAMED_CAMERA, CalibrationResult
@@ -181,7 +182,10 @@ class Tracker:
         Raises:
             EstimationError: there is no estimate; or the calibration has changed since: take the earlier
                 parts out of the graph, and begin with the whole.
+            FactorError: ``since`` is no marginal of a tracker.
         """
+        if since is not None:
+            checked_type("since", since, TrackedMarginal, "what Tracker.marginal() gave, or None")
         if not self.estimate.exists:
             raise EstimationError("the tracker has no estimate yet: no marginal")
         point, starts = self.estimate.point, self.estimate.starts

@@ -73,7 +73,7 @@ def test_guess_and_settings(drive: KeptDrive, options: dict[str, Any], message: 
         calibrate(drive, **options)
 
 
-@pytest.mark.parametrize("camera", [None, PinholeCamera(np.nan, 1.0, 1.0, 1.0, 10, 10)])
+@pytest.mark.parametrize("camera", [None, PinholeCamera(1e-3, 1e-3, 1.0, 1.0, 10, 10)])
 def test_a_source_without_a_camera(drive: KeptDrive, camera: Any) -> None:
     with pytest.raises(SstGraphError, match="camera: "):
         calibrate(dataclasses.replace(drive, camera=camera))

@@ -149,4 +149,14 @@ def test_a_rig_by_its_folder_and_by_its_file(tmp_path: Path, capsys: pytest.Capt
     assert capsys.readouterr().out == by_folder
     assert main(["export", str(tmp_path), "--to", "kitti"]) == 2
     assert "expected the folder of one of its cameras" in capsys.readouterr().err
+    wrong = dataclasses.replace(rig, status="not_converged")
+    (tmp_path / "rig.json").write_text(wrong.to_json())
+    for reasons, said in (((), ""), (("too dark",), ": cam1: too dark")):
+        camera = dataclasses.replace(rig.cameras["cam1"], status="not_converged", reasons=reasons)
+        (tmp_path / "cam1" / "calibration.json").write_text(camera.to_json())
+        assert main(["export", str(tmp_path), "--to", "urdf", "--force"]) == 0
+        warning = "sst-graph: warning: not_converged, exported all the same"
+        assert capsys.readouterr().err == f"{warning}{said}\n"
+    (tmp_path / "rig.json").write_text(rig.to_json())
+    (tmp_path / "cam1" / "calibration.json").write_text(rig.cameras["cam1"].to_json())
     assert main(["export", str(tmp_path / "cam0"), "--to", "kitti"]) == 0

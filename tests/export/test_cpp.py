@@ -65,3 +65,6 @@ def test_cpp_refuses_another_file(reader: Path, tmp_path: Path) -> None:
     path.write_text('{"format": "something else", "version": 1}')
     done = subprocess.run([reader, path], input="", capture_output=True, text=True, timeout=60)
     assert done.returncode == 2 and "not an sst-graph/marginal" in done.stderr
+    missing = tmp_path / "missing.json"
+    done = subprocess.run([reader, missing], input="", capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2 and "missing.json: cannot be opened" in done.stderr

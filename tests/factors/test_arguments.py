@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gtsam
 import numpy as np
 import pytest
 
@@ -73,7 +74,12 @@ def test_no_positive_numbers(value: object) -> None:
         (1.5, "1.5"),
         (True, "True"),
         ([1, 2], "a list of 2"),
-        ("abc", "a str"),
+        ("abc", "the text 'abc'"),
+        (np.float64(1.5), "1.5"),
+        (10**50, "an int of more than 40 digits"),
+        (gtsam.noiseModel.Isotropic.Sigma(1, 2.0), "an Isotropic"),
+        (gtsam.noiseModel.Unit.Create(1), "a Unit"),
+        (gtsam.Pose3, "the class Pose3"),
     ],
 )
 def test_a_value_in_short(value: object, word: str) -> None:

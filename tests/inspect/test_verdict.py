@@ -10,8 +10,9 @@ import pytest
 
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.fit import FitQuality
-from sst_graph.inspect.reasons import MOST_LETTERS, short_reason, short_reasons
+from sst_graph.inspect.reasons import MOST_LETTERS, as_sentence, short_reason, short_reasons
 from sst_graph.inspect.verdict import largest_sigmas, misfits, quality_line, verdict
+from sst_graph.odometry.sweep import REMEDY
 from sst_graph.result import CalibrationResult
 
 CAMERA = PinholeCamera(700.0, 700.0, 620.0, 187.0, 1241, 375)
@@ -112,6 +113,13 @@ def test_a_reason_is_what_and_remedy(reason: str, short: str) -> None:
 def test_long_reasons_are_cut_at_a_word() -> None:
     short = short_reason("word " * 100 + ": do this " + "and that " * 50)
     assert len(short) <= MOST_LETTERS and short.endswith("…") and "word…: do this and that" in short
+
+
+def test_the_remedy_of_an_undecided_sweep_is_whole() -> None:
+    found = "the scans do not show whether they are compensated (a, b), and it matters: 1 deg, 2 cm"
+    short = short_reason(f"a_drive_with_a_long_name/2011_09_26_0011: {found}; {REMEDY}")
+    assert short.endswith(f": {REMEDY}") and len(short) <= MOST_LETTERS
+    assert as_sentence(short) == short + "." and as_sentence("cut…") == "cut…"
 
 
 def test_reasons_that_shorten_alike_are_one() -> None:

@@ -33,14 +33,23 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _reasons(result: CalibrationResult | RigResult) -> list[str]:
+    """Why it is not ok; of a rig, its own reasons and those of its cameras."""
+    found = list(result.reasons)
+    if isinstance(result, RigResult):
+        for name, camera in result.cameras.items():
+            found += [f"{name}: {reason}" for reason in camera.reasons]
+    return found
+
+
 def _text(args: argparse.Namespace) -> str:
     """The result in its new format."""
     result = _result(args.result)
     if result.status != "ok":
         if not args.force:
             raise ConfigError(f"{args.result}: found status {result.status}, expected ok (or --force)")
-        reasons = " ".join("; ".join(result.reasons).split())
-        complain(f"warning: {result.status}, exported all the same: {reasons}")
+        reasons = " ".join("; ".join(_reasons(result)).split())
+        complain(f"warning: {result.status}, exported all the same" + (f": {reasons}" if reasons else ""))
     options = ExportOptions(
         args.camera_frame,
         args.camera_link,

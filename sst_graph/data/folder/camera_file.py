@@ -22,8 +22,7 @@ import numpy as np
 from sst_graph.cameras.model import CameraModel
 from sst_graph.cameras.readers import camera_from_opencv, camera_of, cameras_from_kalibr
 from sst_graph.errors import DataError
-from sst_graph.factors.camera import PinholeCamera
-from sst_graph.files.checked_values import checked_pose
+from sst_graph.files.checked_values import checked_pose, pinhole_camera
 from sst_graph.files.yaml_file import number, numbers, read_yaml
 
 _EXPECTED = "fx, fy, cx, cy, width, height; or Kalibr's cam0; or OpenCV's camera_matrix"
@@ -43,7 +42,7 @@ def read_camera(path: Path) -> CameraModel:
         names = ("fx", "fy", "cx", "cy", "width", "height")
         fx, fy, cx, cy, *size = (number(_entry(table, name, path), f"{path} ({name})") for name in names)
         width, height = (_whole(side, path) for side in size)
-        intrinsics = PinholeCamera(fx, fy, cx, cy, width, height)
+        intrinsics = pinhole_camera((fx, fy, cx, cy), (width, height), path)
         coefficients = numbers(table.get("distortion") or [], f"{path} (distortion)")
         return camera_of(intrinsics, str(table.get("distortion_model", "none")), coefficients, path)
     if isinstance(table.get("cam0"), dict):

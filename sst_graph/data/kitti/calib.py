@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.files.checked_values import checked_camera, checked_pose
+from sst_graph.files.checked_values import checked_pose, pinhole_camera
 from sst_graph.files.reading import CALIB_TXT, read_text
 
 FloatArray = NDArray[np.float64]
@@ -87,8 +87,7 @@ class KittiCalibration:
         """
         P = self.projection(name)
         fx, fy, cx, cy = float(P[0, 0]), float(P[1, 1]), float(P[0, 2]), float(P[1, 2])
-        camera = PinholeCamera(fx, fy, cx, cy, width=width, height=height)
-        return checked_camera(camera, f"{self.path} (P of {name})")
+        return pinhole_camera((fx, fy, cx, cy), (width, height), f"{self.path} (P of {name})")
 
     def cTc0(self, camera: str) -> gtsam.Pose3:
         """Pose of the rectified camera 0 in ``camera``: [I | K^-1 P[:, 3]].

@@ -24,7 +24,7 @@ SweepKind = Literal["compensated", "clockwise", "counterclockwise", "undecided",
 given."""
 FRACTIONS: dict[str, float] = {"compensated": 0.0, "clockwise": -1.0, "counterclockwise": 1.0}
 
-REMEDY = "say --sweep compensated, clockwise or counterclockwise, or give the time of each point"
+REMEDY = "say --sweep compensated, clockwise or counterclockwise, or give points' times"
 
 
 _SAMPLED_PAIRS = 6

@@ -91,7 +91,7 @@ def test_a_symbol_is_its_key(bench, name):
         (True, "True"),
         (-1, "-1"),
         (2**64, str(2**64)),
-        ("E0", "a str"),
+        ("E0", "the text 'E0'"),
         (np.eye(4), r"shape \(4, 4\)"),
         (np.zeros(6), r"shape \(6,\)"),
         (gtsam.Rot3(), "a Rot3"),
