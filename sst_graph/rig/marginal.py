@@ -73,7 +73,7 @@ class RigMarginal(ByValue):
             return self.keys()
         what, expected = "keys of a rig's marginal", f"keys (E, D) of each of {', '.join(self.names)}"
         checked_type(what, keys, Mapping, f"a dict with {expected}")
-        named = {}
+        named: dict[str, int] = {}
         for name in self.names:
             pair = keys.get(name)
             if not (isinstance(pair, tuple | list) and len(pair) == 2):
