@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -73,7 +74,7 @@ class RigMarginal(ByValue):
             return self.keys()
         what, expected = "keys of a rig's marginal", f"keys (E, D) of each of {', '.join(self.names)}"
         checked_type(what, keys, Mapping, f"a dict with {expected}")
-        named: dict[str, int] = {}
+        named: dict[str, Any] = {}
         for name in self.names:
             pair = keys.get(name)
             if not (isinstance(pair, tuple | list) and len(pair) == 2):

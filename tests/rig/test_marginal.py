@@ -6,8 +6,10 @@ import gtsam
 import numpy as np
 import pytest
 from rigs import marginal_of
+from wrong_objects import WRONG
 
 from sst_graph.errors import ConfigError
+from sst_graph.factors import FactorError
 
 
 def test_the_factor_is_the_quadratic_of_the_covariance() -> None:
@@ -70,3 +72,19 @@ def test_common_errors_cancel_between_cameras() -> None:
 def test_a_camera_that_is_not_there() -> None:
     with pytest.raises(ConfigError, match="cam0, cam1"):
         marginal_of(2).relative_pose("cam7", "cam0")
+
+
+def test_keys_of_another_kind_are_refused() -> None:
+    marginal = marginal_of(2)
+    right = {"cam0": (1, 2), "cam1": (3, 4)}
+    for call in (marginal.factor, marginal.point):
+        for kind, wrong in WRONG.items():
+            if kind != "None":
+                with pytest.raises(FactorError, match="rig's marginal"):
+                    call(wrong)
+            for pair in (wrong, (wrong, 2)):
+                if kind != "int" or pair is wrong:
+                    with pytest.raises(FactorError, match="rig's marginal"):
+                        call({**right, "cam0": pair})
+        with pytest.raises(FactorError, match="distinct keys"):
+            call({**right, "cam1": (1, 4)})

@@ -111,6 +111,16 @@ def test_a_mask_bias_that_is_no_variable_is_found_and_considered() -> None:
     assert robust_covariance(P, TermSums.of(whole, 1.0), ErrorModel(0, 0, 1), variable).mask_biases_px == {}
 
 
+def test_a_mask_bias_has_a_sigma_in_a_graph_that_holds_less_than_the_matches() -> None:
+    """The factors of the matches were scaled down, or are another's: a sigma is above 0 all the same."""
+    rows = random_rows(seed=1)
+    sums, P = TermSums.of(TermRows.joined(rows), 1.0), marginal_of(rows, 0.002, 0.0)
+    column = sums.claimed[:, COLUMN]
+    assert column[COLUMN] - column @ P @ column < -1.0  # what the bias's information would be
+    _, sigma = robust_covariance(P, sums, ErrorModel(0.0, 0.0, 1.0), KEYS).mask_biases_px[VEHICLE]
+    assert sigma > 0.0
+
+
 def test_errors_of_sides_are_found_in_the_residuals() -> None:
     rng, rows = np.random.default_rng(3), random_rows(30, 40, 12, seed=3)
     of_side = 2.0 * rng.normal(size=40 * SIDES)
