@@ -126,7 +126,10 @@ def late_masks(drive: KeptDrive) -> KeptDrive:
 
 
 def backwards(drive: KeptDrive) -> KeptDrive:
-    """Both sensors' recordings played backwards under stamps that run on."""
+    """Both sensors' recordings played backwards under stamps that run on.
+
+    That is a vehicle in reverse whose images are as much early as they were late: so the truth.
+    """
     scans = [f.scan for f in reversed(drive.frames)]
     images = [f.image for f in reversed(drive.frames)]
     frames = []
@@ -135,7 +138,17 @@ def backwards(drive: KeptDrive) -> KeptDrive:
             continue
         scan = replace(scan, stamp_ns=frame.scan.stamp_ns)
         frames.append(Frame(frame.index, scan, replace(image, stamp_ns=frame.image.stamp_ns)))
-    return replace(drive, frames=tuple(frames))
+    between_s = [1e-9 * (f.image.stamp_ns - f.scan.stamp_ns) for f in frames if f.image and f.scan]
+    turned = replace(drive, frames=tuple(frames))
+    return with_true_offset(turned, lambda offset_s: -offset_s - 2.0 * float(np.median(between_s)))
+
+
+def with_true_offset(drive: KeptDrive, change: Callable[[float], float]) -> KeptDrive:
+    """The drive with another true time offset, where one is known [s]."""
+    truth = drive.truth
+    if truth is None or truth.time_offset_s is None:
+        return drive
+    return replace(drive, truth=replace(truth, time_offset_s=change(truth.time_offset_s)))
 
 
 def scans_backwards(drive: KeptDrive) -> KeptDrive:
@@ -394,10 +407,7 @@ def next_masks(drive: KeptDrive) -> KeptDrive:
 def another_epoch(drive: KeptDrive, seconds: int) -> KeptDrive:
     """The camera counts from another instant than the LiDAR, and so the truth."""
     later = drive.with_images(lambda i: replace(i, stamp_ns=i.stamp_ns + seconds * 10**9))
-    truth = drive.truth
-    if truth is None or truth.time_offset_s is None:
-        return later
-    return replace(later, truth=replace(truth, time_offset_s=truth.time_offset_s - seconds))
+    return with_true_offset(later, lambda offset_s: offset_s - seconds)
 
 
 def reordered_rings(drive: KeptDrive) -> KeptDrive:
@@ -459,10 +469,11 @@ def raised_lidar(drive: KeptDrive, metres: float) -> KeptDrive:
     return with_numbered_scans(drive, lambda k, s: s if k < middle else replace(s, points=s.points - step))
 
 
-def half_compensated(drive: KeptDrive, seconds: float) -> KeptDrive:
-    """Scans named by the start of their turn, not by its middle; the truth stays that of the middle."""
+def stamped_early(drive: KeptDrive, seconds: float) -> KeptDrive:
+    """Scans stamped by the start of their turn, not by its middle, and so the truth."""
     early = round(1e9 * seconds)
-    return with_numbered_scans(drive, lambda k, s: replace(s, stamp_ns=s.stamp_ns - early))
+    stamped = with_numbered_scans(drive, lambda k, s: replace(s, stamp_ns=s.stamp_ns - early))
+    return with_true_offset(stamped, lambda offset_s: offset_s - seconds)
 
 
 def stretched(drive: KeptDrive, factor: float) -> KeptDrive:
@@ -611,7 +622,7 @@ SUBTLE_FAULTS: dict[str, SubtleFault] = {
     "intrinsics of another day": of_another_day,
     "LiDAR slips by 10 cm in the middle": lambda d: raised_lidar(d, 0.1),
     "LiDAR tilted by 1 deg in the middle": lambda d: knocked(d, 1.0),
-    "scans stamped 50 ms early": lambda d: half_compensated(d, 0.05),
+    "scans stamped 50 ms early": lambda d: stamped_early(d, 0.05),
     "pictures stretched by 2 % in height": lambda d: stretched(d, 1.02),
     "lens askew, p1 = 0.004": lambda d: tangentially_distorted(d, 0.004),
     "beams 2 % farther apart": lambda d: wider_beams(d, 1.02),
