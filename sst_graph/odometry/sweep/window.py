@@ -385,7 +385,7 @@ def _surfaces(points: FloatArray) -> _Surfaces:
     return _Surfaces(points, normals, azimuths, sectors, _of_every_direction(normals, _POINTS_PER_DIRECTION))
 
 
-def _scatter(points: FloatArray, near: IntArray) -> FloatArray:
+def _scatter(points: FloatArray, near: IndexArray) -> FloatArray:
     """(m, 3, 3) sums of the squared deviations of k points each from their mean, near (k, m) among points
     (n, 3): axis by axis, which is many times faster."""
     each = [column.take(near) for column in np.ascontiguousarray(points.T)]
