@@ -374,8 +374,7 @@ def _surfaces(points: FloatArray) -> _Surfaces:
     if len(points) <= _NEIGHBOURS:
         return _Surfaces(*(np.zeros((0, 3)),) * 2, np.zeros(0), *(np.zeros(0, np.intp),) * 2)
     _, near = cKDTree(points).query(points, k=_NEIGHBOURS)
-    around = points[near] - points[near].mean(axis=1, keepdims=True)
-    values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
+    values, vectors = np.linalg.eigh(_scatter(points, np.ascontiguousarray(near.T)))
     width = np.sqrt(np.maximum(values, 1e-12))
     flat = (width[:, 0] < _MAX_THICKNESS_RATIO * width[:, 1]) & (width[:, 1] > _MIN_WIDTH_RATIO * width[:, 2])
     points, normals = points[flat], vectors[flat][:, :, 0]
@@ -384,6 +383,15 @@ def _surfaces(points: FloatArray) -> _Surfaces:
     azimuths = np.arctan2(points[:, 1], points[:, 0])
     sectors = np.minimum((turned(azimuths, -np.pi) * SECTORS).astype(np.intp), SECTORS - 1)
     return _Surfaces(points, normals, azimuths, sectors, _of_every_direction(normals, _POINTS_PER_DIRECTION))
+
+
+def _scatter(points: FloatArray, near: IndexArray) -> FloatArray:
+    """(m, 3, 3) sums of the squared deviations of k points each from their mean, near (k, m) among points
+    (n, 3): axis by axis, which is many times faster."""
+    each = [column.take(near) for column in np.ascontiguousarray(points.T)]
+    around = [column - column.mean(axis=0) for column in each]
+    sums = [(a * b).sum(axis=0) for a in around for b in around]
+    return np.stack(sums, axis=1).reshape(-1, 3, 3)
 
 
 def _of_every_direction(normals: FloatArray, most: int) -> IndexArray:
