@@ -76,6 +76,8 @@ def main() -> None:
         sigmas = np.sqrt(np.diag(result.covariance))
         print(f"{name:10s} {result.status}  {row(error)}  sigmas {row(sigmas)}", end="")
         print(f"  NEES/7 {nees[-1]:.2f}  {seconds:.0f} s", flush=True)
+        for reason in result.reasons:
+            print(f"    {reason}", flush=True)
     table = np.abs(np.array(errors) * UNITS)
     rotation, shift = np.linalg.norm(table[:, :3], axis=1), table[:, 3:6].mean(axis=1)
     for what, column in (

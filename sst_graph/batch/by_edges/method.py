@@ -52,9 +52,18 @@ KERNELS_PX = (*[5.0] * 6, *[4.0] * 3, *[3.0] * 3, *[2.0] * 2, 1.5, 1.2)
 below most of their distances. Then :data:`NEAR_KERNELS_PX` until nothing moves."""
 SCORE_PX = 1.5
 """Blur under which solutions are compared [px]."""
-_TURNS_DEG = np.array([[0.0, 0.0, -0.8], [0.0, 0.0, 0.8], [0.0, -0.5, 0.0], [0.0, 0.5, 0.0]])
+_TURNS_DEG = np.array(
+    [
+        [0.0, 0.0, -0.8],
+        [0.0, 0.0, 0.8],
+        [0.0, -0.5, 0.0],
+        [0.0, 0.5, 0.0],
+        [-0.8, 0.0, 0.0],
+        [0.8, 0.0, 0.0],
+    ]
+)
 """(n, 3) turns about the camera's axes from which an estimate is solved again: false optima lie close by in
-roll, and in yaw with a shift to the side [deg]."""
+roll, in yaw with a shift to the side, and in pitch with a shift in height [deg]."""
 _RESTARTS = 4
 """Most times that a better optimum is followed."""
 _BETTER = 1.005
