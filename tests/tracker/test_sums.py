@@ -20,6 +20,7 @@ from sst_graph.graph.linear import unit_scale
 from sst_graph.graph.state import EXTRINSIC, State, bias_key, object_bias_key, time_offset_key
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.simulator import SimulationConfig
+from sst_graph.tracker.monitor.statistic import ChangeStatistic, EstimateCovariance
 from sst_graph.tracker.sums.linearized_pair import LinearizedPair, PairColumns, linearize_pair
 from sst_graph.tracker.sums.running_sums import RunningSums
 from sst_graph.tracker.window.gaussian import Point
@@ -109,3 +110,20 @@ def test_the_sums_are_the_batch_s(
     batch, both = robust.matrix[:7, :7], np.outer(sigmas, sigmas)
     np.testing.assert_allclose(exact / both, batch / both, atol=1e-8)
     np.testing.assert_allclose(found / both, batch / both, atol=0.02)
+
+
+def test_parts_of_frames_are_compared_as_each_by_itself(
+    matched: tuple[RobustCovariance, Point, list[LinearizedPair]],
+) -> None:
+    _, point, linear = matched
+    model = RunningSums.empty(point.size).error_model(linear)
+    known = EstimateCovariance(1e-6 * np.eye(point.size), point.tracks, point.core_size)
+    statistic, n = ChangeStatistic(25.0, 0.5), len(linear)
+    parts = [(0, 2), (2, n), (n - 3, n), (1, n - 1)]
+    alone = [statistic.normalized(statistic.compare(linear[a:b], known, model)) for a, b in parts]
+    assert len({round(value, 6) for value in alone}) == len(parts)
+    for part, value in zip(parts, alone, strict=True):
+        found = statistic.largest_of_parts(linear, [part], known, model)
+        assert found == pytest.approx(value, rel=1e-9)
+    assert statistic.largest_of_parts(linear, parts, known, model) == pytest.approx(max(alone), rel=1e-9)
+    assert statistic.largest_of_parts(linear, [(1, 1)], known, model) == 0.0

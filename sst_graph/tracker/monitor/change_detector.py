@@ -11,6 +11,8 @@ from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.monitor.confirmation import (
@@ -201,8 +203,14 @@ class ChangeDetector:
             *((k, n) for k in cuts),
             *((k, k + FRAMES) for k in range(n - FRAMES + 1)),
         }
-        found = [[score for own in scores[a:b] for score in own] for a, b in parts]
-        return max((self._value(some, estimate) for some in found if some), default=0.0)
+        # A scan whose matches are all left out has no score.
+        place = np.cumsum([0, *map(len, scores)]).tolist()
+        return self.statistic.largest_of_parts(
+            [score for own in scores for score in own],
+            {(place[a], place[b]) for a, b in parts},
+            estimate.covariance,
+            estimate.model,
+        )
 
     # ------------------------------------------------------------------ new frames
 

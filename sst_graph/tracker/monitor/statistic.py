@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.covariance.error_model import ErrorModel
-from sst_graph.covariance.sums import total
+from sst_graph.covariance.sums import ScoreSums, total
 from sst_graph.tracker.sums.linearized_pair import LinearizedPair
 from sst_graph.tracker.window.gaussian import Point
 
@@ -106,19 +106,7 @@ class Comparison:
         object_sigma_px: float,
     ) -> Comparison:
         """object_sigma_px: standard deviation of a new object's mask bias from its class's [px]."""
-        n = covariance.core_size
-        places = {track: place for score in scores for track, place in score.places.items()}
-        order = list(places)
-        H, g = np.zeros((n, n + len(order))), np.zeros(n)
-        for score in scores:
-            own = [*range(n), *(n + order.index(track) for track in score.information.point.tracks)]
-            H[:, own] += score.information.information[:n]
-            g += score.information.vector[:n]
-        core = [score.scores.columns(slice(n)) for score in scores]
-        # A few frames do not determine the objects' biases; at least the variance of independent matches.
-        least = replace(model, match=max(1.0, model.match))
-        M = total(n, core, [np.arange(n)] * len(core)).variance(least)
-        return cls(g, H, M + _LEAST_INFORMATION * np.eye(n), covariance.with_objects(places, object_sigma_px))
+        return ComparedScores.of(scores, covariance, model, object_sigma_px).part(0, len(scores))
 
     def chi2(self) -> float:
         """T of the frames."""
@@ -130,6 +118,54 @@ class Comparison:
         biases[:7], biases[:, :7] = 0.0, 0.0
         variance = self.noise + self.jacobian @ biases @ self.jacobian.T
         return np.array([_squared(gradient, variance) for gradient in (self.jacobian[:, :7] @ steps).T])
+
+
+@dataclass(frozen=True)
+class ComparedScores:
+    """The scores of k pairs, made ready for comparisons of parts of them with one estimate.
+
+    Attributes:
+        gradients, jacobians: (k, n), (k, n, m) of each pair, as of :class:`Comparison`.
+        sums: of each pair's scores, in the n unknowns.
+        prior: P (m, m).
+        model: variances of residuals.
+    """
+
+    gradients: FloatArray
+    jacobians: FloatArray
+    sums: Sequence[ScoreSums]
+    prior: FloatArray
+    model: ErrorModel
+
+    @classmethod
+    def of(
+        cls,
+        scores: Collection[LinearizedPair],
+        covariance: EstimateCovariance,
+        model: ErrorModel,
+        object_sigma_px: float,
+    ) -> ComparedScores:
+        """The arguments are those of :meth:`Comparison.of`."""
+        n = covariance.core_size
+        places = {track: place for score in scores for track, place in score.places.items()}
+        column = {track: n + k for k, track in enumerate(places)}
+        H, g = np.zeros((len(scores), n, n + len(places))), np.zeros((len(scores), n))
+        for k, score in enumerate(scores):
+            own = [*range(n), *(column[track] for track in score.information.point.tracks)]
+            H[k][:, own] = score.information.information[:n]
+            g[k] = score.information.vector[:n]
+        # A few frames do not determine the objects' biases; at least the variance of independent matches.
+        least = replace(model, match=max(1.0, model.match))
+        sums = [score.scores.columns(slice(n)) for score in scores]
+        return cls(g, H, sums, covariance.with_objects(places, object_sigma_px), least)
+
+    def part(self, start: int, end: int) -> Comparison:
+        """The comparison of some of the pairs, one after the other."""
+        n, sums = self.gradients.shape[1], self.sums[start:end]
+        noise = total(n, sums, [np.arange(n)] * len(sums)).variance(self.model)
+        noise = noise + _LEAST_INFORMATION * np.eye(n)
+        jacobian = self.jacobians[start:end].sum(axis=0)
+        return Comparison(self.gradients[start:end].sum(axis=0), jacobian, noise, self.prior)
 
 
 class ChangeStatistic:
@@ -179,6 +215,17 @@ class ChangeStatistic:
     ) -> Comparison:
         """Scores of any frames against an estimate."""
         return Comparison.of(scores, covariance, model, self.object_sigma_px)
+
+    def largest_of_parts(
+        self,
+        scores: Sequence[LinearizedPair],
+        parts: Collection[tuple[int, int]],
+        covariance: EstimateCovariance,
+        model: ErrorModel,
+    ) -> float:
+        """Largest :meth:`normalized` statistic of parts (start, end) of the scores; 0 without any."""
+        compared = ComparedScores.of(scores, covariance, model, self.object_sigma_px)
+        return max((self.normalized(compared.part(a, b)) for a, b in parts if b > a), default=0.0)
 
     def normalized(self, comparison: Comparison) -> float:
         """T over its usual size."""
