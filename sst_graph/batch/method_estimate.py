@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.batch.config import CalibrationConfig
-from sst_graph.batch.shared_errors import SharedErrors
 from sst_graph.config import to_dict
 from sst_graph.covariance.observability import (
     MOTION,
@@ -23,6 +22,7 @@ from sst_graph.covariance.observability import (
     involves_offset,
     open_directions,
 )
+from sst_graph.covariance.shared_errors import SharedErrors
 from sst_graph.drive.preparation import Drive
 from sst_graph.drive.stamp_intervals import jumps_of
 from sst_graph.fit import QUALITY, Fit

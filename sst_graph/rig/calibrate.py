@@ -23,10 +23,10 @@ from sst_graph.batch.calibrate import (
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import Guess, MethodEstimate
 from sst_graph.batch.problem import CalibrationProblem
-from sst_graph.batch.shared_errors import SharedErrors
 from sst_graph.batch.sources import as_sources
 from sst_graph.config import to_dict
 from sst_graph.covariance.observability import open_directions
+from sst_graph.covariance.shared_errors import SharedErrors
 from sst_graph.drive.further_camera import with_camera
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import ConfigError

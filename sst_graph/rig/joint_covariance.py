@@ -11,7 +11,7 @@ how far, the residuals show, by their correlation over the sides, and points, th
 blocks of single cameras are their own covariances, unchanged.
 
 Estimates by edges have their errors as steps of half-samples of the objects
-(:class:`~sst_graph.batch.shared_errors.SharedErrors`), which are the same in all cameras.
+(:class:`~sst_graph.covariance.shared_errors.SharedErrors`), which are the same in all cameras.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.batch.shared_errors import SharedErrors
+from sst_graph.covariance.shared_errors import SharedErrors
 from sst_graph.graph.linear import unit_scale
 from sst_graph.rig.influences import KINDS, UNKNOWNS, CameraInfluences, Influence
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sst_graph.batch.shared_errors import FEWEST, SharedErrors
+from sst_graph.covariance.shared_errors import FEWEST, SharedErrors
 from sst_graph.rig.influences import KINDS, CameraInfluences, Influence
 from sst_graph.rig.joint_covariance import joint_covariance
 

@@ -24,8 +24,8 @@ from sst_graph.assumptions import OF_LIDAR
 from sst_graph.batch.by_edges.parts import thinned, with_objects, without_kind
 from sst_graph.batch.by_edges.positions import considered_positions
 from sst_graph.batch.problem import JointEstimate
-from sst_graph.batch.shared_errors import FEWEST, SharedErrors, spread_covariance
 from sst_graph.covariance.considered import AssumptionConfig, Considered, considered_by_matches
+from sst_graph.covariance.shared_errors import FEWEST, SharedErrors, spread_covariance
 from sst_graph.errors import EstimationError
 from sst_graph.features.lidar_edges import Edge
 from sst_graph.graph.outer_loop import JointProblem, solve_joint

@@ -24,7 +24,7 @@ from sst_graph.batch.by_edges.reasons import MAX_WIDER_KERNEL_STEP, wider_kernel
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.batch.method_estimate import Guess
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
-from sst_graph.batch.shared_errors import FEWEST, spread_covariance
+from sst_graph.covariance.shared_errors import FEWEST, spread_covariance
 from sst_graph.drive.preparation import Drive
 from sst_graph.features.lidar_edges import Edge
 from sst_graph.graph.outer_loop import solve_joint
