@@ -1,0 +1,82 @@
+"""Stereo pairs without labels on simulated streets: errors, joint covariance, what a known pose adds. A table.
+
+    OMP_NUM_THREADS=1 python -m studies.edges_rigs --seeds 507 504 550 551
+
+Streets and starts are those of ``studies.edges_streets``; the second camera has KITTI's baseline and the same
+trigger. NEES are divided by their dimension.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph import CalibrationConfig
+from sst_graph.batch.method_estimate import Guess
+from sst_graph.rig import KnownPose, KnownRig, RigResult
+from sst_graph.rig.calibrate import calibrate_rig_prepared, prepare_rig
+from sst_graph.simulator import SimulatedDrive
+from sst_graph.simulator.rig import beside, stereo_pose, with_mounts
+from studies.edges_streets import source_of, start_step
+
+FloatArray = NDArray[np.float64]
+CONFIG = CalibrationConfig(method="edges")
+KNOWN = {
+    "own images": KnownRig(),
+    "known pose, one trigger": KnownRig((KnownPose("right", "left", stereo_pose()),), one_trigger=True),
+}
+
+
+def nees(error: FloatArray, covariance: FloatArray) -> float:
+    return float(error @ np.linalg.solve(covariance, error)) / len(error)
+
+
+def row(rig: dict[str, SimulatedDrive], result: RigResult) -> str:
+    """Errors of both cameras, the NEES of each, of both at once and of the pose between them."""
+    errors, cells = [], []
+    for name, drive in rig.items():
+        one = result[name]
+        step = gtsam.Pose3.Logmap(one.T_camera_lidar.between(drive.truth.cTl))
+        error = np.append(step, drive.config.time_offset_s - one.time_offset_s)
+        errors.append(error)
+        degrees, centimetres = np.degrees(np.linalg.norm(error[:3])), 100.0 * np.linalg.norm(error[3:6])
+        cells.append(f"{degrees:.2f}°, {centimetres:.1f} cm, {1e3 * error[6]:+.1f} ms, {one.status}")
+        cells.append(f"{nees(error, one.covariance):.2f}")
+    sigmas = np.sqrt(np.diag(result.covariance))
+    shared = np.diag(result.covariance[:7, 7:]) / (sigmas[:7] * sigmas[7:])
+    between = result.relative_pose("right", "left")
+    step = gtsam.Pose3.Logmap(stereo_pose().between(between.T_camera_reference))
+    cells += [
+        f"{nees(np.concatenate(errors), result.covariance):.2f}",
+        f"{nees(step, between.covariance):.2f}",
+    ]
+    cells.append(", ".join(f"{value:.2f}" for value in shared[:3]))
+    return " | ".join(cells)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[507, 504])
+    print(
+        "| street | known | left | NEES | right | NEES | of both | of the pose between | shared rotation |\n"
+        + "|---" * 9
+        + "|"
+    )
+    for seed in parser.parse_args().seeds:
+        name = f"own-{seed}"
+        drive = source_of(name)
+        assert isinstance(drive, SimulatedDrive)
+        rig = with_mounts(drive, {"right": beside(drive, stereo_pose())}, "left")
+        drives = prepare_rig({camera: [one] for camera, one in rig.items()}, CONFIG)
+        start = start_step(name)
+        guesses = {camera: Guess(one.truth.cTl.retract(start)) for camera, one in rig.items()}
+        for known, what in KNOWN.items():
+            found = calibrate_rig_prepared(drives, guesses, CONFIG, what)
+            print(f"| `{name}` | {known} | {row(rig, found)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
