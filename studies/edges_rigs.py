@@ -1,4 +1,4 @@
-"""Stereo pairs without labels on simulated streets: errors, joint covariance, what a known pose adds. A table.
+"""Stereo pairs without labels on simulated streets: errors, joint covariance, what a known pose adds.
 
     OMP_NUM_THREADS=1 python -m studies.edges_rigs --seeds 507 504 550 551
 
