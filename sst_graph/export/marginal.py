@@ -18,11 +18,15 @@ from numpy.typing import NDArray
 
 from sst_graph.errors import EstimationError
 from sst_graph.export.agreement import SIGNIFICANCE, check_agreement
+from sst_graph.factors.arguments import checked_type
+from sst_graph.factors.custom.variables import checked_keys
+from sst_graph.factors.errors import FactorError
 from sst_graph.marginal import EXTRINSIC, FORMAT, TIME_OFFSET, VERSION, CalibrationMarginal, read_marginal
 from sst_graph.marginal import carried as _carried
 from sst_graph.marginal import inverse as _inverse
 from sst_graph.result import CalibrationResult
 from sst_graph.types import Calibration
+from sst_graph.validation import checked_guess
 
 __all__ = [
     "EXTRINSIC",
@@ -49,7 +53,9 @@ def marginal_of_result(result: CalibrationResult) -> CalibrationMarginal:
 
     Raises:
         EstimationError: the covariance has no inverse.
+        FactorError: no result.
     """
+    checked_type("result", result, CalibrationResult, "a CalibrationResult")
     information = _inverse(result.covariance, "covariance of the result")
     return CalibrationMarginal(result.T_camera_lidar, result.time_offset_s, information, np.zeros(7))
 
@@ -60,7 +66,7 @@ def marginal_of_graph(
     E_key: int = EXTRINSIC,
     D_key: int = TIME_OFFSET,
     *,
-    at: Calibration | None = None,
+    at: Calibration | tuple[gtsam.Pose3, float] | None = None,
 ) -> CalibrationMarginal:
     """A graph's cost on (E, D), everything else eliminated.
 
@@ -74,9 +80,11 @@ def marginal_of_graph(
 
     Raises:
         EstimationError: the other variables are not determined even when E and D are given.
+        FactorError: no graph, no values, or none of E or D.
     """
+    E_key, D_key = _checked_keys(graph, values, E_key, D_key)
     if at is not None:
-        values = _others_at(graph, values, E_key, D_key, at)
+        values = _others_at(graph, values, E_key, D_key, _point(at))
     others = [key for key in values.keys() if key not in (E_key, D_key)]  # noqa: SIM118  (gtsam, no dict)
     ordering = gtsam.Ordering()
     for key in (E_key, D_key, *others):
@@ -94,6 +102,31 @@ def marginal_of_graph(
         g[:7] - coupling @ g[7:],
         f - float(g[7:] @ inner @ g[7:]),
     )
+
+
+def _checked_keys(graph: object, values: object, E_key: int, D_key: int) -> tuple[int, int]:
+    """The keys of extrinsic and time offset, if these are a graph and its values, and have them."""
+    checked_type("graph", graph, gtsam.NonlinearFactorGraph, "a NonlinearFactorGraph")
+    checked_type("values", values, gtsam.Values, "Values")
+    assert isinstance(values, gtsam.Values)
+    E, D = checked_keys("a marginal", {"E_key": E_key, "D_key": D_key})
+    for key in (E, D):
+        if not values.exists(key):
+            expected = f"one of the key {gtsam.DefaultKeyFormatter(key)}"
+            raise FactorError("values", "none of extrinsic or time offset", expected)
+    return E, D
+
+
+def _point(at: Calibration | tuple[gtsam.Pose3, float]) -> Calibration:
+    """An extrinsic and a time offset that are both."""
+    expected = "a Calibration, or a pair of extrinsic and time offset"
+    checked_type("at", at, (Calibration, tuple, list), expected)
+    parts = list(at)
+    if len(parts) != 2 or not isinstance(parts[0], gtsam.Pose3):
+        raise FactorError("at", "no such pair", expected)
+    cTl, offset_s = checked_guess(*parts)
+    assert cTl is not None
+    return Calibration(cTl, offset_s)
 
 
 def _others_at(
@@ -152,7 +185,14 @@ def fuse_graphs(
     Raises:
         ContradictionError: the drives contradict one another.
         EstimationError: a direction that no drive determines, or no convergence.
+        FactorError: no pairs of a graph and its values.
     """
+    expected = "pairs of a NonlinearFactorGraph and its Values"
+    checked_type("graphs", graphs, (list, tuple), expected)
+    for pair in graphs:
+        checked_type("graphs", pair, (list, tuple), expected)
+        if len(pair) != 2:
+            raise FactorError("graphs", f"{len(pair)} objects", expected)
     parts = [marginal_of_graph(graph, values, E_key, D_key) for graph, values in graphs]
     fused = fuse_marginals(parts, significance=significance)
     for _ in range(max_rounds):
@@ -187,7 +227,11 @@ def fuse_marginals(
         ContradictionError: they contradict one another; the message names the worst and its step.
         EstimationError: none given, a direction that none of them determines, one that takes information away
             (to be added with ``significance=0``), or no optimum.
+        FactorError: no marginals.
     """
+    checked_type("marginals", marginals, (list, tuple), "a list of CalibrationMarginal")
+    for each in marginals:
+        checked_type("marginals", each, CalibrationMarginal, "a list of CalibrationMarginal")
     if not marginals:
         raise EstimationError("no marginal to fuse")
     if names and len(names) != len(marginals):

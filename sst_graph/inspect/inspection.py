@@ -117,8 +117,10 @@ def inspect_result(result: CalibrationResult, next_frames: int = 10) -> Inspecti
 
     Raises:
         ConfigError: less than one frame, or more than :data:`MOST_NEXT_FRAMES`.
-        DataError: the result's information by frame is malformed.
+        DataError: no result, or one whose information by frame is malformed.
     """
+    if not isinstance(result, CalibrationResult):
+        raise DataError("result", f"a {type(result).__name__}", "a CalibrationResult (read_result)")
     if not 1 <= next_frames <= MOST_NEXT_FRAMES:
         expected = f"at least 1 and at most {MOST_NEXT_FRAMES}"
         raise ConfigError(f"next_frames: found {next_frames}, expected {expected}")

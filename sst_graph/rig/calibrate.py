@@ -24,12 +24,13 @@ from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import Guess, MethodEstimate
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.batch.sources import as_sources
-from sst_graph.config import to_dict
+from sst_graph.config import expect_settings, to_dict
 from sst_graph.covariance.observability import open_directions
 from sst_graph.covariance.shared_errors import SharedErrors
 from sst_graph.drive.further_camera import with_camera
 from sst_graph.drive.preparation import Drive, Progress
-from sst_graph.errors import ConfigError
+from sst_graph.errors import ConfigError, DataError
+from sst_graph.factors.arguments import checked_type
 from sst_graph.fit import QUALITY
 from sst_graph.graph.outer_loop import KERNELS_PX
 from sst_graph.result import CalibrationResult, Status
@@ -46,6 +47,7 @@ from sst_graph.rig.known import KnownRig
 from sst_graph.rig.marginal import RigMarginal
 from sst_graph.rig.result import RigResult, worst
 from sst_graph.types import Source
+from sst_graph.validation import checked_guess
 
 FloatArray = NDArray[np.float64]
 
@@ -75,14 +77,17 @@ def calibrate_rig(
     Raises:
         DataError: the frames cannot be used, or two cameras have different scans.
         ConfigError: the settings contradict each other or the data.
+        FactorError: no dict of cameras or guesses, or nothing known of a rig.
     """
-    sources, known = {name: as_sources(own) for name, own in cameras.items()}, known or KnownRig()
-    config = with_method_for_cameras(config or CalibrationConfig(), list(sources.values()))
+    known = KnownRig() if known is None else known
+    checked_type("cameras", cameras, Mapping, "a dict of sources by the camera's name")
+    checked_type("known", known, KnownRig, "a KnownRig, or None")
+    sources = {name: as_sources(own) for name, own in cameras.items()}
+    guesses = _guesses(list(sources), initial or {}, initial_time_offsets_s or {})
+    config = with_method_for_cameras(expect_settings(config, CalibrationConfig), list(sources.values()))
     _check(sources, config)
     known.check(list(sources))
     drives = prepare_rig(sources, config, progress)
-    initial, offsets_s = initial or {}, initial_time_offsets_s or {}
-    guesses = {name: Guess(initial.get(name), offsets_s.get(name, 0.0)) for name in drives}
     return calibrate_rig_prepared(drives, guesses, config, known, progress)
 
 
@@ -126,6 +131,22 @@ def calibrate_rig_prepared(
     # 4. What is known of the rig, where the estimates do not contradict it.
     after = adjusted(rig.marginal, rig.agreed)
     return rig.result(after, config)
+
+
+def _guesses(
+    names: Sequence[str], initial: Mapping[str, gtsam.Pose3 | None], offsets_s: Mapping[str, float]
+) -> dict[str, Guess]:
+    """The guess of each camera.
+
+    Raises:
+        DataError: one that is no guess, or of a camera that is not there.
+    """
+    for what, given in (("initial", initial), ("initial_time_offsets_s", offsets_s)):
+        checked_type(what, given, Mapping, "a dict of guesses by the camera's name")
+        for name in given:
+            if name not in names:
+                raise DataError(what, f"a guess of {name!r:.60}", f"of {', '.join(map(str, names))}")
+    return {name: Guess(*checked_guess(initial.get(name), offsets_s.get(name, 0.0))) for name in names}
 
 
 def _check(sources: Mapping[str, Sequence[Source]], config: CalibrationConfig) -> None:

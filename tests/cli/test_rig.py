@@ -105,7 +105,10 @@ def test_as_json_with_videos_inside(street: Path, tmp_path: Path, capsys: pytest
         (["--camera", "image_2", "image_3", "--rig-sigma", "1,1"], "--rig-sigma: expected with --rig"),
         (["--camera", "image_2", "image_3", "--rig", "dataset", "--rig-sigma", "a"], "expected DEG,CM"),
         (["--camera", "image_2", "image_3", "--rig", "none.yaml"], "none.yaml"),
-        (["--camera", "image_2", "image_3", "--method", "motion"], "need method joint or edges, found motion"),
+        (
+            ["--camera", "image_2", "image_3", "--method", "motion"],
+            "method joint or edges, found motion",
+        ),
         (["--camera", "image_2", "image_3", "--video", "a.avi"], "a_image_2.avi: expected a name that ends"),
     ],
 )

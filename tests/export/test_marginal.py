@@ -13,9 +13,10 @@ import gtsam
 import numpy as np
 import pytest
 from stored import simulated
+from wrong_objects import WRONG
 
 from sst_graph.drive.preparation import PrepareConfig, prepare_drive
-from sst_graph.errors import ContradictionError, DataError, EstimationError
+from sst_graph.errors import ContradictionError, DataError, EstimationError, SstGraphError
 from sst_graph.export import (
     EXTRINSIC,
     TIME_OFFSET,
@@ -26,7 +27,7 @@ from sst_graph.export import (
     marginal_of_result,
     read_marginal,
 )
-from sst_graph.factors import Alignment, RobustKernel, frame_factor, residuals, time_offset_prior
+from sst_graph.factors import Alignment, FactorError, RobustKernel, frame_factor, residuals, time_offset_prior
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.graph.building import GraphConfig, Tracks, associate, joint_graph
 from sst_graph.graph.state import State
@@ -444,3 +445,26 @@ def test_graphs_of_drives_with_two_mounts_are_refused() -> None:
     assert in_sigmas(fused, *_batch(graphs)) < 1e-3
     with pytest.raises(EstimationError, match="found 1 names, expected 2"):
         fuse_marginals([agreeing(1), agreeing(2)], names=("a",))
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_is_no_marginal_is_refused(name: str) -> None:
+    """By a sentence of ours, whatever stands in the place of an argument."""
+    wrong = WRONG[name]
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    values.insert(EXTRINSIC, gtsam.Pose3())
+    values.insert(TIME_OFFSET, np.zeros(1))
+    calls = {
+        "result": lambda: marginal_of_result(wrong),
+        "marginals": lambda: fuse_marginals([wrong]),
+        "a list": lambda: fuse_marginals(wrong),
+        "graphs": lambda: fuse_graphs([wrong]),
+        "pairs": lambda: fuse_graphs(wrong),
+        "graph": lambda: marginal_of_graph(graph if name == "graph" else wrong, gtsam.Values()),
+        "values": lambda: marginal_of_graph(graph, wrong),
+        "key": lambda: marginal_of_graph(graph, values, wrong),
+        "at": lambda: marginal_of_graph(graph, values, at=wrong) if wrong is not None else fuse_marginals([]),
+    }
+    for call in calls.values():
+        with pytest.raises((FactorError, SstGraphError)):
+            call()

@@ -15,7 +15,8 @@ from sst_graph import CalibrationConfig, calibrate
 from sst_graph.batch.method_estimate import Guess
 from sst_graph.config import with_overrides
 from sst_graph.data.kept_drive import KeptDrive
-from sst_graph.errors import ConfigError, DataError
+from sst_graph.errors import ConfigError, DataError, SstGraphError
+from sst_graph.factors import FactorError
 from sst_graph.odometry.sweep.decision import SweepDecision
 from sst_graph.rig import KnownPose, KnownRig, RigMarginal, RigResult, calibrate_rig
 from sst_graph.rig.adjustment import adjusted
@@ -246,6 +247,25 @@ def test_settings_that_a_rig_has_not(overrides: list[str], found: str) -> None:
     config = with_overrides(CalibrationConfig(), overrides)
     with pytest.raises(ConfigError, match=found):
         calibrate_rig(dict(rig()), config=config)
+
+
+@pytest.mark.parametrize(
+    ("given", "found"),
+    [
+        ({"cameras": None}, "cameras: found None, expected a dict"),
+        ({"cameras": [1, 2]}, "cameras: found a list"),
+        ({"cameras": {"left": 7}}, "frames to calibrate"),
+        ({"initial": gtsam.Pose3()}, "initial: found a Pose3"),
+        ({"initial": {"lift": None}}, "initial: found a guess of 'lift', expected of left, right"),
+        ({"initial": {"left": 7}}, "initial: found a int"),
+        ({"initial_time_offsets_s": {"left": "1"}}, "initial time offset: found a str"),
+        ({"config": {}}, "config: found a dict"),
+        ({"known": 7}, "known: found 7"),
+    ],
+)
+def test_what_is_no_rig_is_refused(given: dict, found: str) -> None:
+    with pytest.raises((SstGraphError, FactorError), match=found):
+        calibrate_rig(**{"cameras": dict(rig()), **given})
 
 
 def test_cameras_with_other_scans() -> None:
