@@ -65,7 +65,7 @@ class CalibrationMarginal(ByValue):
         Raises:
             FactorError: no keys, or one for both.
         """
-        E_key, D_key = _checked_keys(E_key, D_key)
+        E_key, D_key = marginal_keys(E_key, D_key)
         L, g = self.information, self.vector
         hessian = gtsam.HessianFactor(
             E_key, D_key, L[:6, :6], L[:6, 6:], g[:6], L[6:, 6:], g[6:], self.constant
@@ -78,7 +78,7 @@ class CalibrationMarginal(ByValue):
         Raises:
             FactorError: no keys, or one for both.
         """
-        E_key, D_key = _checked_keys(E_key, D_key)
+        E_key, D_key = marginal_keys(E_key, D_key)
         values = gtsam.Values()
         values.insert(E_key, self.cTl)
         values.insert(D_key, np.array([self.time_offset_s]))
@@ -126,7 +126,7 @@ class CalibrationMarginal(ByValue):
         Raises:
             FactorError: no keys, or one for both.
         """
-        E_key, D_key = _checked_keys(E_key, D_key)
+        E_key, D_key = marginal_keys(E_key, D_key)
         document = {
             "format": FORMAT,
             "version": VERSION,
@@ -165,7 +165,12 @@ class CalibrationMarginal(ByValue):
         )
 
 
-def _checked_keys(E_key: Any, D_key: Any) -> tuple[int, int]:
+def marginal_keys(E_key: Any, D_key: Any) -> tuple[int, int]:
+    """The keys of extrinsic and time offset, if they are two.
+
+    Raises:
+        FactorError: no keys, or one for both.
+    """
     E, D = checked_keys("a marginal", {"E_key": E_key, "D_key": D_key})
     return E, D
 

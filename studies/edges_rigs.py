@@ -10,19 +10,17 @@ from __future__ import annotations
 
 import argparse
 
-import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph import CalibrationConfig
 from sst_graph.batch.method_estimate import Guess
+from sst_graph.metrics import nees, tangent_error
 from sst_graph.rig import KnownPose, KnownRig, RigResult
 from sst_graph.rig.calibrate import calibrate_rig_prepared, prepare_rig
 from sst_graph.simulator import SimulatedDrive
 from sst_graph.simulator.rig import beside, stereo_pose, with_mounts
 from studies.edges_streets import source_of, start_step
 
-FloatArray = NDArray[np.float64]
 CONFIG = CalibrationConfig(method="edges")
 KNOWN = {
     "own images": KnownRig(),
@@ -30,29 +28,23 @@ KNOWN = {
 }
 
 
-def nees(error: FloatArray, covariance: FloatArray) -> float:
-    return float(error @ np.linalg.solve(covariance, error)) / len(error)
-
-
 def row(rig: dict[str, SimulatedDrive], result: RigResult) -> str:
     """Errors of both cameras, the NEES of each, of both at once and of the pose between them."""
     errors, cells = [], []
     for name, drive in rig.items():
         one = result[name]
-        step = gtsam.Pose3.Logmap(one.T_camera_lidar.between(drive.truth.cTl))
-        error = np.append(step, drive.config.time_offset_s - one.time_offset_s)
+        late_s = one.time_offset_s - drive.config.time_offset_s
+        error = tangent_error(one.T_camera_lidar, drive.truth.cTl, late_s)
         errors.append(error)
         degrees, centimetres = np.degrees(np.linalg.norm(error[:3])), 100.0 * np.linalg.norm(error[3:6])
         cells.append(f"{degrees:.2f}°, {centimetres:.1f} cm, {1e3 * error[6]:+.1f} ms, {one.status}")
-        cells.append(f"{nees(error, one.covariance):.2f}")
+        cells.append(f"{nees(error, one.covariance) / 7:.2f}")
     sigmas = np.sqrt(np.diag(result.covariance))
     shared = np.diag(result.covariance[:7, 7:]) / (sigmas[:7] * sigmas[7:])
     between = result.relative_pose("right", "left")
-    step = gtsam.Pose3.Logmap(stereo_pose().between(between.T_camera_reference))
-    cells += [
-        f"{nees(np.concatenate(errors), result.covariance):.2f}",
-        f"{nees(step, between.covariance):.2f}",
-    ]
+    step = tangent_error(between.T_camera_reference, stereo_pose())[:6]
+    of_both, of_pose = nees(np.concatenate(errors), result.covariance), nees(step, between.covariance)
+    cells += [f"{of_both / 14:.2f}", f"{of_pose / 6:.2f}"]
     cells.append(", ".join(f"{value:.2f}" for value in shared[:3]))
     return " | ".join(cells)
 

@@ -20,37 +20,30 @@ from sst_graph import open_source
 from sst_graph.assumptions import ASSUMPTIONS, View
 from sst_graph.data.frame_parts import image_at, image_positions
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.odometry.features import FeatureTracker, Tracks
+from sst_graph.odometry.features import Tracks
 from sst_graph.odometry.relative import (
-    DirectionMotion,
     _line_distance,
     _refine,
     _softened,
     huber_weights,
     rays,
-    relative_pose,
     skew,
 )
+from sst_graph.odometry.visual import ImagePair, image_pairs
 from sst_graph.types import Source
 
 FloatArray = NDArray[np.float64]
 LENS = ("focal", "cx", "cy", "k1", "k2")
-_INTERVAL_S, _STRETCHES, _ITERATIONS = 0.07, 10, 4
+_STRETCHES, _ITERATIONS = 10, 4
 _STEP = 1e-3
 """Of the numerical derivative, as a share of a parameter's span; an iteration that moves less is the last."""
 
 
-def image_pairs(source: Source) -> list[tuple[Tracks, DirectionMotion]]:
+def tracked(source: Source) -> list[ImagePair]:
     """Tracks between images of a drive, where they have a direction of motion."""
-    tracker, found = FeatureTracker(), []
-    for position in image_positions(source):
-        image = image_at(source, position)
-        if image is None or tracker.seconds_to(image) < _INTERVAL_S:
-            continue
-        tracks = tracker.add(image)
-        if tracks is not None:
-            found.append((tracks, relative_pose(tracks, source.camera)))
-    return [pair for pair in found if pair[1].ok]
+    images = (image_at(source, position) for position in image_positions(source))
+    pairs = image_pairs((image for image in images if image is not None), source.camera)
+    return [pair for pair in pairs if pair.direction.ok]
 
 
 def pixel_shift(name: str, uvs: FloatArray, camera: PinholeCamera) -> FloatArray:
@@ -62,13 +55,21 @@ def pixel_shift(name: str, uvs: FloatArray, camera: PinholeCamera) -> FloatArray
     return shift
 
 
+def lens_rays(
+    tracks: Tracks, name: str, value: float, camera: PinholeCamera
+) -> tuple[FloatArray, FloatArray]:
+    """(n, 3) rays through both pixels of tracks, by a lens with this parameter."""
+    fa, fb = (rays(uv - value * pixel_shift(name, uv, camera), camera) for uv in (tracks.uv_a, tracks.uv_b))
+    return fa, fb
+
+
 def distances(
     motion: tuple[FloatArray, FloatArray], tracks: Tracks, name: str, value: float, camera: PinholeCamera
 ) -> FloatArray:
     """(n,) distance from the epipolar line, in pixels as they were seen: a lens that draws them together
     does not make it smaller."""
     aRb, direction = motion
-    fa, fb = (rays(uv - value * pixel_shift(name, uv, camera), camera) for uv in (tracks.uv_a, tracks.uv_b))
+    fa, fb = lens_rays(tracks, name, value, camera)
     line_a = fa @ skew(-direction[None])[0].T
     gradient = (line_a @ aRb)[:, :2] / [camera.fx, camera.fy]
     steps = np.eye(2)
@@ -81,18 +82,14 @@ def distances(
     return np.asarray(np.einsum("ij,ij->i", line_a, fb @ aRb.T) / _softened(np.hypot(*gradient.T), camera))
 
 
-def estimate(
-    pairs: Sequence[tuple[Tracks, DirectionMotion]], camera: PinholeCamera, name: str
-) -> tuple[float, float, float]:
+def estimate(pairs: Sequence[ImagePair], camera: PinholeCamera, name: str) -> tuple[float, float, float]:
     """A parameter, its deviation by stretches, and by the noise of the tracks alone."""
     step = _STEP * ASSUMPTIONS[name].span
     value, scores, information = 0.0, np.zeros(len(pairs)), np.zeros(len(pairs))
-    motions = [(motion.rotation.matrix(), motion.direction) for _, motion in pairs]
+    motions = [(pair.direction.rotation.matrix(), pair.direction.direction) for pair in pairs]
     for _ in range(_ITERATIONS):
-        for k, (tracks, _) in enumerate(pairs):
-            fa, fb = (
-                rays(uv - value * pixel_shift(name, uv, camera), camera) for uv in (tracks.uv_a, tracks.uv_b)
-            )
+        for k, tracks in enumerate(pair.tracks for pair in pairs):
+            fa, fb = lens_rays(tracks, name, value, camera)
             refined = _refine(*motions[k], fa, fb, camera)
             motions[k] = refined.rotation, refined.direction
             r = distances(motions[k], tracks, name, value, camera)
@@ -125,7 +122,7 @@ def main() -> None:
     )
     for drive in parser.parse_args().drives:
         source = open_source(drive)
-        pairs = image_pairs(source)
+        pairs = tracked(source)
         for name in LENS:
             value, sigma, least = estimate(pairs, source.camera, name)
             print(f"| {source.name} | {name} | {value:.3g} | {sigma:.2g} | {least:.2g} |", flush=True)

@@ -294,6 +294,20 @@ def knocked(drive: KeptDrive, degrees: float) -> KeptDrive:
 # ------------------------------------------------------------------- pictures
 
 
+def with_warped_pictures(
+    drive: KeptDrive, warp: Callable[[NDArray[np.uint8], int], NDArray[np.uint8]]
+) -> KeptDrive:
+    """Pictures and masks by ``warp``, which takes an array and how to interpolate."""
+    return drive.with_images(
+        lambda i: replace(
+            i,
+            mask=warp(i.mask, cv2.INTER_NEAREST),
+            pixels=warp(i.pixels, cv2.INTER_LINEAR),
+            instances=None,
+        )
+    )
+
+
 def cropped(drive: KeptDrive, share: float = 0.9) -> KeptDrive:
     """The middle of pictures and masks blown up to the full size, where a smaller picture was expected."""
     width, height = drive.camera.width, drive.camera.height
@@ -303,14 +317,7 @@ def cropped(drive: KeptDrive, share: float = 0.9) -> KeptDrive:
     def blown_up(array: NDArray[np.uint8], how: int) -> NDArray[np.uint8]:
         return cv2.resize(array[v : v + h, u : u + w], (width, height), interpolation=how)
 
-    return drive.with_images(
-        lambda i: replace(
-            i,
-            mask=blown_up(i.mask, cv2.INTER_NEAREST),
-            pixels=blown_up(i.pixels, cv2.INTER_LINEAR),
-            instances=None,
-        )
-    )
+    return with_warped_pictures(drive, blown_up)
 
 
 def cut_off(drive: KeptDrive, columns: int, rows: int) -> KeptDrive:
@@ -369,14 +376,7 @@ def sheared(drive: KeptDrive, pixels: float) -> KeptDrive:
     def slanted(array: NDArray[np.uint8], how: int) -> NDArray[np.uint8]:
         return cv2.warpAffine(array, M, shape, flags=how, borderMode=cv2.BORDER_REPLICATE)
 
-    return drive.with_images(
-        lambda i: replace(
-            i,
-            mask=slanted(i.mask, cv2.INTER_NEAREST),
-            pixels=slanted(i.pixels, cv2.INTER_LINEAR),
-            instances=None,
-        )
-    )
+    return with_warped_pictures(drive, slanted)
 
 
 # ---------------------------------------------------------------------- further ones
@@ -495,20 +495,6 @@ def tangentially_distorted(drive: KeptDrive, p1: float) -> KeptDrive:
     at = at.reshape(camera.height, camera.width, 2).astype(np.float32)
     return with_warped_pictures(
         drive, lambda array, how: cv2.remap(array, at, None, how, borderMode=cv2.BORDER_REPLICATE)
-    )
-
-
-def with_warped_pictures(
-    drive: KeptDrive, warp: Callable[[NDArray[np.uint8], int], NDArray[np.uint8]]
-) -> KeptDrive:
-    """Pictures and masks by ``warp``, which takes an array and how to interpolate."""
-    return drive.with_images(
-        lambda i: replace(
-            i,
-            mask=warp(i.mask, cv2.INTER_NEAREST),
-            pixels=warp(i.pixels, cv2.INTER_LINEAR),
-            instances=None,
-        )
     )
 
 

@@ -122,6 +122,13 @@ def checked_values(
             raise FactorError(what, f"no {key_name(key)}", "a value for each key of the graph")
 
 
+def checked_problem(where: str, graph: Any, values: Any, further: Iterable[int] = ()) -> None:
+    """Nothing, where they are a graph and values of all its keys, and of the further keys."""
+    checked_type(f"graph of {where}", graph, gtsam.NonlinearFactorGraph, "a NonlinearFactorGraph")
+    factors = [graph.at(i) for i in range(graph.size()) if graph.exists(i)]
+    checked_values(f"values of {where}", values, factors, further)
+
+
 def checked_keys(factor: str, keys: Sequence[Any] | Mapping[str, Any]) -> dict[int, str]:
     """Distinct keys of a factor, with the name of the argument that each came as ('' where it has none)."""
     if isinstance(keys, Mapping):

@@ -111,9 +111,13 @@ class Considered:
     sensitivities: Mapping[str, FloatArray]
     sigmas: Mapping[str, float]
 
+    def step(self, name: str) -> FloatArray:
+        """(n,) step of the estimate by one deviation of a parameter."""
+        return np.asarray(self.sigmas[name] * self.sensitivities[name])
+
     def part(self, name: str) -> FloatArray:
         """(n, n) covariance by one assumption."""
-        step = self.sigmas[name] * self.sensitivities[name]
+        step = self.step(name)
         return np.outer(step, step)
 
     def covariance(self, size: int) -> FloatArray:

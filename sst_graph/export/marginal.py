@@ -19,9 +19,16 @@ from numpy.typing import NDArray
 from sst_graph.errors import EstimationError
 from sst_graph.export.agreement import SIGNIFICANCE, check_agreement
 from sst_graph.factors.arguments import checked_type
-from sst_graph.factors.custom.variables import checked_keys
 from sst_graph.factors.errors import FactorError
-from sst_graph.marginal import EXTRINSIC, FORMAT, TIME_OFFSET, VERSION, CalibrationMarginal, read_marginal
+from sst_graph.marginal import (
+    EXTRINSIC,
+    FORMAT,
+    TIME_OFFSET,
+    VERSION,
+    CalibrationMarginal,
+    marginal_keys,
+    read_marginal,
+)
 from sst_graph.marginal import carried as _carried
 from sst_graph.marginal import inverse as _inverse
 from sst_graph.result import CalibrationResult
@@ -109,7 +116,7 @@ def _checked_keys(graph: object, values: object, E_key: int, D_key: int) -> tupl
     checked_type("graph", graph, gtsam.NonlinearFactorGraph, "a NonlinearFactorGraph")
     checked_type("values", values, gtsam.Values, "Values")
     assert isinstance(values, gtsam.Values)
-    E, D = checked_keys("a marginal", {"E_key": E_key, "D_key": D_key})
+    E, D = marginal_keys(E_key, D_key)
     for key in (E, D):
         if not values.exists(key):
             expected = f"one of the key {gtsam.DefaultKeyFormatter(key)}"

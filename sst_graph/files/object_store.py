@@ -216,6 +216,20 @@ def restored(node: Node, data: bytes | memoryview, classes: Classes, blocks: Seq
         raise ValueError(f"{type(error).__name__}: {error}") from error
 
 
+def attribute_node(node: Node, name: str) -> Node:
+    """The node of one attribute of a stored object; the first one refers to nothing beside it.
+
+    Raises:
+        ValueError: no object, or one without it.
+    """
+    match node:
+        case ["object", str(), ["dict", list(attributes), *_], *_]:
+            for each in attributes:
+                if isinstance(each, list) and len(each) == 2 and each[0] == name:
+                    return each[1]
+    raise ValueError(f"no object with {name}")
+
+
 def lay_out(root: object, done: Container[int] = ()) -> None:
     """Give the arrays in an object the memory layout, and its sets the order, that they are read back with.
 

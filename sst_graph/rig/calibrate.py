@@ -202,22 +202,19 @@ class _Camera:
         return self.estimate is not None and self.result.status != "not_converged"
 
     @cached_property
-    def influences(self) -> CameraInfluences | None:
-        """How errors move the estimate; None where it informs no other camera."""
-        outcome = self.estimate.solved if self.estimate is not None and self.trusted else None
-        return None if outcome is None else CameraInfluences.of(outcome)
-
-    @property
-    def shared(self) -> SharedErrors | None:
-        """Errors that other cameras have, too; None where it informs no other camera, or by labels."""
-        return self.estimate.shared if self.estimate is not None and self.trusted else None
+    def errors(self) -> CameraInfluences | SharedErrors | None:
+        """What moves the estimate; None where it informs no other camera."""
+        if self.estimate is None or not self.trusted:
+            return None
+        outcome = self.estimate.solved
+        return self.estimate.shared if outcome is None else CameraInfluences.of(outcome)
 
     @property
     def clusters(self) -> float:
         """Effective number of sides of objects, or of half-samples of them, behind its covariance."""
         outcome = None if self.estimate is None else self.estimate.solved
         if outcome is None:
-            return 1.0 if self.shared is None else float(self.shared.estimated)
+            return float(self.errors.estimated) if isinstance(self.errors, SharedErrors) else 1.0
         table = outcome.estimate.robust.table
         weights = np.bincount(table.sides, table.root_weights**2)
         return float(weights.sum() ** 2 / max(float(weights @ weights), 1e-12))
@@ -270,10 +267,8 @@ class _Rig:
 
     @cached_property
     def joint(self) -> JointCovariance:
-        cameras = self.cameras.values()
         covariances = [self._covariance(name) for name in self.cameras]
-        influences = [camera.influences for camera in cameras]
-        return joint_covariance(covariances, influences, [camera.shared for camera in cameras])
+        return joint_covariance(covariances, [camera.errors for camera in self.cameras.values()])
 
     def _covariance(self, name: str) -> FloatArray:
         """(7, 7) of a camera's own estimate; wide where that is not to be trusted and others know better."""

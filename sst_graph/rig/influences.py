@@ -99,11 +99,7 @@ class CameraInfluences:
             scale * left_out[:, :UNKNOWNS],
             scans,
             root * motion,
-            {
-                name: considered.sigmas[name] * considered.sensitivities[name][:UNKNOWNS]
-                for name in OF_LIDAR
-                if name in considered.sensitivities
-            },
+            {name: considered.step(name)[:UNKNOWNS] for name in OF_LIDAR if name in considered.sensitivities},
         )
 
 

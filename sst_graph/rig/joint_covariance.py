@@ -52,33 +52,30 @@ class JointCovariance:
 
 
 def joint_covariance(
-    covariances: Sequence[FloatArray],
-    influences: Sequence[CameraInfluences | None],
-    shared: Sequence[SharedErrors | None] = (),
+    covariances: Sequence[FloatArray], errors: Sequence[CameraInfluences | SharedErrors | None]
 ) -> JointCovariance:
     """The joint covariance of cameras with covariances (7, 7) each.
 
     Args:
-        influences: of each camera; None for one without an estimate by labels.
-        shared: errors of each camera in their place; None for one without an estimate by edges.
+        errors: of each camera, by labels or by edges; None for one without an estimate, which has nothing in
+            common.
     """
-    shared = shared or [None] * len(covariances)
     n = len(covariances)
     whole = np.zeros((UNKNOWNS * n, UNKNOWNS * n))
-    known = [own for own in influences if own is not None]
+    known = [own for own in errors if isinstance(own, CameraInfluences)]
     correlations = {kind: _correlation([own.matches[kind] for own in known]) for kind in KINDS}
     blocks = [slice(UNKNOWNS * i, UNKNOWNS * (i + 1)) for i in range(n)]
     for i, covariance in enumerate(covariances):
         whole[blocks[i], blocks[i]] = covariance
     for i, j in combinations(range(n), 2):
-        one, other = influences[i], influences[j]
-        if one is not None and other is not None:
+        one, other = errors[i], errors[j]
+        if isinstance(one, CameraInfluences) and isinstance(other, CameraInfluences):
             cross = _cross(one, other, correlations)
-            whole[blocks[i], blocks[j]], whole[blocks[j], blocks[i]] = cross, cross.T
-        mine, its = shared[i], shared[j]
-        if mine is not None and its is not None:
-            cross = mine.cross_covariance(its)
-            whole[blocks[i], blocks[j]], whole[blocks[j], blocks[i]] = cross, cross.T
+        elif isinstance(one, SharedErrors) and isinstance(other, SharedErrors):
+            cross = one.cross_covariance(other)
+        else:
+            continue
+        whole[blocks[i], blocks[j]], whole[blocks[j], blocks[i]] = cross, cross.T
     sides = [own.matches["side"].names for own in known]
     seen = np.unique(np.concatenate([np.zeros(0, np.int64), *sides]), return_counts=True)[1]
     return JointCovariance(_positive(whole, blocks), correlations, int((seen > 1).sum()))

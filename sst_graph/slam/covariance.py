@@ -40,7 +40,7 @@ from sst_graph.covariance.observability import limits_of_unknowns, weak_directio
 from sst_graph.covariance.sums import ScoreSums
 from sst_graph.errors import EstimationError
 from sst_graph.factors.arguments import checked_type
-from sst_graph.factors.custom.variables import checked_values
+from sst_graph.factors.custom.variables import checked_problem
 from sst_graph.graph.linear import covariance_root
 from sst_graph.result import WeakDirection
 from sst_graph.slam.alignment_keys import COLUMNS, POSITIONS, AlignmentKeys, bias_column
@@ -108,9 +108,7 @@ def calibration_covariance(
     """
     config = expect_settings(config, RematchConfig)
     where = "calibration_covariance"
-    checked_type(f"graph of {where}", graph, gtsam.NonlinearFactorGraph, "a NonlinearFactorGraph")
-    factors = [graph.at(i) for i in range(graph.size()) if graph.exists(i)]
-    checked_values(f"values of {where}", values, factors)
+    checked_problem(where, graph, values)
     expected = "a list of TermMatches, as AlignmentTerm.matched gives them"
     checked_type(f"matches of {where}", matches, (list, tuple), expected)
     for each in matches:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from sst_graph.config import expect_settings
 from sst_graph.errors import EstimationError
 from sst_graph.factors.arguments import checked_type
-from sst_graph.factors.custom.variables import checked_values
+from sst_graph.factors.custom.variables import checked_problem
 from sst_graph.factors.priors import time_offset_prior
 from sst_graph.slam.alignment_keys import AlignmentKeys
 from sst_graph.slam.alignment_term import AlignmentTerm, TermMatches
@@ -112,11 +112,9 @@ def solve_with_terms(
         ConfigError: no settings.
     """
     config = expect_settings(config, RematchConfig)
-    checked_type("graph of solve_with_terms", graph, gtsam.NonlinearFactorGraph, "a NonlinearFactorGraph")
     checked_terms("solve_with_terms", terms)
-    factors = [graph.at(i) for i in range(graph.size()) if graph.exists(i)]
     lasting = [key for term in terms for key in term.keys.lasting]
-    checked_values("values of solve_with_terms", values, factors, lasting)
+    checked_problem("solve_with_terms", graph, values, lasting)
     if not terms:
         raise EstimationError("solve_with_terms: found no term, expected one or more")
     keys, kernel_px, held = terms[0].keys, config.first_px, True

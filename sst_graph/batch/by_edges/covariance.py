@@ -24,7 +24,7 @@ from sst_graph.assumptions import OF_LIDAR
 from sst_graph.batch.by_edges.parts import thinned, with_objects, without_kind
 from sst_graph.batch.by_edges.positions import considered_positions
 from sst_graph.batch.problem import JointEstimate
-from sst_graph.covariance.considered import AssumptionConfig, Considered, considered_by_matches
+from sst_graph.covariance.considered import AssumptionConfig, considered_by_matches
 from sst_graph.covariance.shared_errors import FEWEST, SharedErrors, spread_covariance
 from sst_graph.errors import EstimationError
 from sst_graph.features.lidar_edges import Edge
@@ -109,7 +109,8 @@ def edges_covariance(
     }
     total = np.asarray(sum(parts.values()), np.float64)
     sigmas = {name: np.sqrt(np.diag(part)).tolist() for name, part in parts.items()}
-    common = _deviations(considered, OF_LIDAR) | _deviations(positions, tuple(positions.sigmas))
+    common = {name: considered.step(name)[:7] for name in OF_LIDAR if name in considered.sigmas}
+    common |= {name: positions.step(name) for name in positions.sigmas}
     # What no part of the model explains may be the LiDAR's.
     common |= {f"floor_{axis}": step for axis, step in enumerate(np.diag(FLOOR)) if step.any()}
     if outlines is not None:
@@ -118,15 +119,6 @@ def edges_covariance(
     doubts = {FEW_OBJECTS: shared.estimated < FEWEST, FEW_OUTLINES: outlines is None}
     reasons = tuple(reason for reason, holds in doubts.items() if holds)
     return EdgesCovariance(total, sigmas | {"samples": shared.estimated}, reasons, shared)
-
-
-def _deviations(considered: Considered, names: Sequence[str]) -> dict[str, FloatArray]:
-    """(7,) step by one deviation of each of these errors, by its name."""
-    return {
-        name: considered.sigmas[name] * considered.sensitivities[name][:7]
-        for name in names
-        if name in considered.sensitivities
-    }
 
 
 def half_samples() -> BoolArray:

@@ -28,7 +28,16 @@ import numpy as np
 from sst_graph.errors import CheckpointError, DataError
 from sst_graph.files import atomic_write_in_steps
 from sst_graph.files.checked_values import checked_camera
-from sst_graph.files.object_store import Block, Blocks, Node, class_name, lay_out, restored, stored
+from sst_graph.files.object_store import (
+    Block,
+    Blocks,
+    Node,
+    attribute_node,
+    class_name,
+    lay_out,
+    restored,
+    stored,
+)
 from sst_graph.files.reading import FileKind, parse_json, read_file
 from sst_graph.odometry.sweep import SweepDecision
 from sst_graph.tracker.make_update import current_update
@@ -263,15 +272,16 @@ def load_checkpoint(
 
 
 def checkpoint_setup(path: str | Path) -> Setup:
-    """Camera, settings and guess of the tracker in a checkpoint, which is not checked beyond that.
+    """Camera, settings and guess of the tracker in a checkpoint; nothing else of it is restored.
 
     Raises:
         CheckpointError: as :func:`load_checkpoint`.
     """
     document, data = _read(path)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        setup = getattr(_tracker(document, data, path), "setup", None)
+    try:
+        setup = restored(attribute_node(document.get("tracker"), "setup"), data, checkpoint_classes())
+    except ValueError as error:
+        raise CheckpointError(path, f"an incomplete checkpoint ({error})", "all of a tracker") from error
     if not isinstance(setup, Setup):
         raise CheckpointError(
             path, f"a checkpoint with a setup of {type(setup).__name__}", "all of a tracker"
