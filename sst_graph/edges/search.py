@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from sst_graph.edges.agreement import BlurredScore
 from sst_graph.graph.matching import DriveEdges
+from sst_graph.stepwise import Stepwise, run_to_end
 
 FloatArray = NDArray[np.float64]
 FloatMap = NDArray[np.float32]
@@ -32,6 +33,8 @@ MODES = 6
 """Most starts that are returned."""
 APART_DEG, APART_S = 0.8, 0.05
 """Starts are farther apart than one of these: nearer ones lead to one estimate [deg], [s]."""
+_POSES, _POSES_WORK, _FIELD_WORK = 240, 8, 2
+"""Poses that are scored in one step, and in units of work what that and the fields of an image cost."""
 _GATE_CHI2 = 25.0
 """Chi-squared, of 3, of the difference from motion's rotation beyond which a pose is not tried."""
 MOTION_FLOOR_DEG = 0.7
@@ -79,6 +82,11 @@ class EdgeStart:
 
 
 def edge_starts(edges: DriveEdges, region: SearchRegion) -> list[EdgeStart]:
+    """All steps of :func:`edge_starts_steps`."""
+    return run_to_end(edge_starts_steps(edges, region))
+
+
+def edge_starts_steps(edges: DriveEdges, region: SearchRegion) -> Stepwise[list[EdgeStart]]:
     """The best poses that are :data:`APART_DEG` or :data:`APART_S` apart, best first; none where nothing is
     in view."""
     edges = edges.thinned(_POINTS)
@@ -90,7 +98,8 @@ def edge_starts(edges: DriveEdges, region: SearchRegion) -> list[EdgeStart]:
         for number, rotations in candidates:
             if stage:
                 rotations = _gated(_around(rotations, step * GRID_DEG), region)
-            found += _scored(edges, region, number, rotations, (blur_px, fields))[:kept]
+            scored = yield from _scored(edges, region, number, rotations, (blur_px, fields))
+            found += scored[:kept]
         found = sorted(found, key=lambda one: -one[0])[:kept]
         candidates = [
             (number, np.stack([R for _, own, R in found if own == number]))
@@ -111,17 +120,23 @@ def _scored(
     number: int,
     rotations: FloatArray,
     blur: tuple[float, dict[int, FloatMap]],
-) -> list[tuple[float, int, FloatArray]]:
+) -> Stepwise[list[tuple[float, int, FloatArray]]]:
     """(score, number of the time offset, rotation (3, 3)) of rotations (m, 3, 3), best first.
 
     Args:
         blur: its sigma [px], and the fields that are known under it.
     """
     blur_px, fields = blur[0] * edges.drive.camera.width / _WIDTH_PX, blur[1]
+    before = len(fields)
     blurred = BlurredScore.of(edges, region.cTl, region.time_offsets_s[number], blur_px, fields)
     if blurred is None:
         return []
-    scores = blurred.scores(rotations, np.tile(region.cTl.translation(), (len(rotations), 1)))
+    yield _FIELD_WORK * (len(fields) - before) + 1
+    scores = np.zeros(0)
+    for a in range(0, len(rotations), _POSES):
+        some = rotations[a : a + _POSES]
+        scores = np.append(scores, blurred.scores(some, np.tile(region.cTl.translation(), (len(some), 1))))
+        yield _POSES_WORK
     return [(float(scores[k]), number, rotations[k]) for k in np.argsort(-scores).tolist()]
 
 

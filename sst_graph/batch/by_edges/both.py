@@ -10,7 +10,8 @@ import numpy as np
 
 from sst_graph.batch.by_edges.fusion import Fused, state_of
 from sst_graph.batch.by_edges.label_parts import split_by_labels
-from sst_graph.batch.by_edges.method import LabelEstimate, edges_method
+from sst_graph.batch.by_edges.method import edges_method
+from sst_graph.batch.by_edges.problem import LabelEstimate
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import Guess, MethodEstimate
 from sst_graph.batch.motion_factor import MAX_DISAGREEMENT_CHI2

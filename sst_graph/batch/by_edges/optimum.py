@@ -1,0 +1,180 @@
+"""The best optimum of edges: starts by a search, refined on a few scans, the best of them on all scans.
+
+All of it in steps (:mod:`sst_graph.stepwise`): the tracker spreads them over frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+
+from sst_graph.batch.by_edges.covariance import NEAR_KERNELS_PX
+from sst_graph.batch.by_edges.problem import EdgesProblem
+from sst_graph.drive.preparation import Progress
+from sst_graph.edges.agreement import score
+from sst_graph.edges.search import edge_starts_steps, turned
+from sst_graph.errors import EstimationError
+from sst_graph.graph.matching import edges_of
+from sst_graph.graph.outer_loop import JointProblem, JointSolution, solve_joint_steps
+from sst_graph.graph.state import State
+from sst_graph.hand_eye.solution import difference
+from sst_graph.stepwise import Stepwise
+
+START_KERNELS_PX = (10.0, 8.0, 6.0, 5.0, 4.0, 3.0)
+"""Scales of the kernel from a start that is a degree off [px]."""
+KERNELS_PX = (*[5.0] * 6, *[4.0] * 3, *[3.0] * 3, *[2.0] * 2, 1.5, 1.2)
+"""From the best of the starts, on all scans [px]. Pictures have edges beside the objects'; the last scale is
+below most of their distances. Then :data:`NEAR_KERNELS_PX` until nothing moves."""
+SCORE_PX = 1.5
+"""Blur under which solutions are compared [px]."""
+_TURNS_DEG = np.array(
+    [
+        [0.0, 0.0, -0.8],
+        [0.0, 0.0, 0.8],
+        [0.0, -0.5, 0.0],
+        [0.0, 0.5, 0.0],
+        [-0.8, 0.0, 0.0],
+        [0.8, 0.0, 0.0],
+    ]
+)
+"""(n, 3) turns about the camera's axes from which an estimate is solved again: false optima lie close by in
+roll, in yaw with a shift to the side, and in pitch with a shift in height [deg]."""
+RESTARTS = 4
+"""Most times that a better optimum is followed."""
+_BETTER = 1.005
+"""Its score is higher by this factor: smaller differences are those of one optimum reached twice."""
+_GAIN = 1.001
+"""A round that raises the score by less than this factor is the last, where only scores are compared."""
+_MAX_ROUNDS = 10
+"""Most times that the near scales are gone through."""
+_CONVERGED_STEP = np.array([*np.radians([0.02] * 3), 0.005, 0.005, 0.005, 0.003])
+"""(7,) a round that moves by no more is the last [rad, m, s]."""
+_EDGES_WORK = 2
+"""How many times the work of an outer iteration with contours one with edges of pictures is."""
+_SCORE_WORK = 5
+"""A score of some scans, in units of work."""
+
+
+def starts_steps(problem: EdgesProblem) -> Stepwise[list[State]]:
+    """Starts by the search, on the drive with most edges in view.
+
+    Raises:
+        EstimationError: none.
+    """
+    if not problem.subset_edges:
+        raise EstimationError("no LiDAR edge in any scan")
+    richest = max(problem.subset_edges, key=len)
+    found = yield from edge_starts_steps(richest, problem.region)
+    if not found:
+        raise EstimationError("no LiDAR edge in any picture")
+    return [State(start.cTl, (start.time_offset_s,)) for start in found]
+
+
+def refined_steps(
+    problem: EdgesProblem, starts: Sequence[State]
+) -> Stepwise[list[tuple[float, JointSolution]]]:
+    """Solutions on a few scans, by their score, best first.
+
+    Raises:
+        EstimationError: none leads anywhere.
+    """
+    found, failures = [], []
+    for start in starts:
+        try:
+            solution = yield from _solution(problem.some, start, START_KERNELS_PX)
+        except EstimationError as error:
+            failures.append(error)
+            continue
+        found.append((score(problem.subset_edges, solution.state, SCORE_PX), solution))
+        yield _SCORE_WORK
+    if not found:
+        raise failures[0]
+    return sorted(found, key=lambda pair: -pair[0])
+
+
+def best_optimum_steps(
+    problem: EdgesProblem, start: State, restarts: int, progress: Progress | None = None
+) -> Stepwise[JointSolution]:
+    """The solution on all scans that no turn leads away from to a better one.
+
+    Raises:
+        EstimationError: too few matches.
+    """
+    wide = yield from _solution(problem.whole, start, KERNELS_PX, progress)
+    best, best_score = yield from _newton_ascent(problem.whole, wide.state, progress)
+    for _ in range(restarts):
+        other = yield from _better_nearby(problem, best)
+        if other is None:
+            break
+        again, found_score = yield from _newton_ascent(problem.whole, other, progress)
+        if found_score < _BETTER * best_score:
+            break
+        best, best_score = again, found_score
+    return (yield from _converged(problem.whole, best, progress))
+
+
+def _solution(
+    problem: JointProblem, start: State, kernels_px: Sequence[float], progress: Progress | None = None
+) -> Stepwise[JointSolution]:
+    """As :func:`~sst_graph.graph.outer_loop.solve_joint_steps`, with the work of edges."""
+    steps = solve_joint_steps(problem, start, kernels_px, progress)
+    while True:
+        try:
+            work = next(steps)
+        except StopIteration as stop:
+            solution: JointSolution = stop.value
+            return solution
+        yield _EDGES_WORK * work
+
+
+def _better_nearby(problem: EdgesProblem, state: State) -> Stepwise[State | None]:
+    """An optimum on a few scans that agrees better than the one at a state; None where none is found."""
+    t = state.cTl.translation()
+    rotations = turned(state.cTl, np.radians(_TURNS_DEG))
+    starts = [state, *(replace(state, cTl=gtsam.Pose3(gtsam.Rot3.ClosestTo(R), t)) for R in rotations)]
+    found = []
+    for start in starts:
+        try:
+            found.append((yield from _newton_ascent(problem.some, start, None)))
+        except EstimationError:
+            if start is state:
+                return None
+    (_, own), *others = found
+    other, found_score = max(others, key=lambda one: one[1], default=(state, 0.0))
+    return other if found_score >= _BETTER * own else None
+
+
+def _newton_ascent(
+    problem: JointProblem, start: State, progress: Progress | None
+) -> Stepwise[tuple[State, float]]:
+    """A state near the optimum that a start leads to, and its score, by few long steps: each point is matched
+    to the peak of its edge, which Newton's method says, until the score gains too little to count."""
+    graph = replace(problem.config.graph, edge_peaks=True)
+    by_peaks = replace(problem, config=replace(problem.config, graph=graph))
+    edges = edges_of(problem.drives, problem.tracks, graph)
+    state, found_score = start, 0.0
+    for _ in range(_MAX_ROUNDS):
+        solution = yield from _solution(by_peaks, state, NEAR_KERNELS_PX, progress)
+        state = solution.state
+        before, found_score = found_score, score(edges, state, SCORE_PX)
+        yield _SCORE_WORK
+        if found_score < _GAIN * before:
+            break
+    return state, found_score
+
+
+def _converged(problem: JointProblem, start: State, progress: Progress | None) -> Stepwise[JointSolution]:
+    """The solution by near edges from a start that is nearly right.
+
+    Soft matches follow the pose, so that steps are too short: the scales are gone through until nothing
+    moves.
+    """
+    state = start
+    for _ in range(_MAX_ROUNDS):
+        solution = yield from _solution(problem, state, NEAR_KERNELS_PX, progress)
+        if (np.abs(difference(state, solution.state)) < _CONVERGED_STEP).all():
+            break
+        state = solution.state
+    return solution
