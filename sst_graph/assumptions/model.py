@@ -88,6 +88,8 @@ class Assumption:
         remedy: what to do about it.
         by_matches: whether the matches can test it. They cannot test the sweep: at constant speed it looks
             like a shift.
+        by_edges: whether edges test it, which estimate all such parameters together
+            (:mod:`sst_graph.batch.by_edges.lens`).
         of_lidar: whether it is about the LiDAR: all cameras on it then have its error in common.
     """
 
@@ -101,6 +103,7 @@ class Assumption:
     remedy: str
     prevalence: float = 0.02
     by_matches: bool = True
+    by_edges: bool = False
     of_lidar: bool = False
 
     def figure(self, value: float, sigma: float) -> str:

@@ -41,14 +41,14 @@ class SharedErrors:
 
 
 def spread_covariance(steps: FloatArray, others: FloatArray | None = None) -> FloatArray:
-    """(7, 7) covariance by the steps (k, 7) of half-samples; 0 of fewer than :data:`FEWEST`.
+    """(n, n) covariance by the steps (k, n) of half-samples; 0 of fewer than :data:`FEWEST`.
 
-    The inverse of a sample covariance is too large on average: by (k - 1) / (k - 2 - 7), of k samples in
-    seven dimensions (Hartlap, Simon and Schneider, Astronomy & Astrophysics 464, 2007). With that factor the
+    The inverse of a sample covariance is too large on average: by (k - 1) / (k - 2 - n), of k samples in n
+    dimensions (Hartlap, Simon and Schneider, Astronomy & Astrophysics 464, 2007). With that factor the
     mean of the NEES is right.
 
     Args:
-        others: (k, 7) steps of another camera's estimate by the same half-samples: the covariance of the two.
+        others: (k, n) steps of another camera's estimate by the same half-samples: the covariance of the two.
     """
     others = steps if others is None else others
     known = np.isfinite(steps).all(axis=1) & np.isfinite(others).all(axis=1)

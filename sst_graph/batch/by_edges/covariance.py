@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.linalg import hadamard
 
 from sst_graph.assumptions import OF_LIDAR
+from sst_graph.batch.assumption_tests import estimated_report
 from sst_graph.batch.by_edges.parts import thinned, with_objects, without_kind
 from sst_graph.batch.by_edges.positions import considered_positions
 from sst_graph.batch.problem import JointEstimate
@@ -68,12 +69,14 @@ class EdgesCovariance:
     Attributes:
         matrix: (7, 7) of extrinsic and time offset.
         sigmas: of its parts, JSON-able.
+        estimated: value and deviation of the parameters that are unknowns of the estimate, by name, JSON-able.
         reasons: to doubt it.
         shared: what of it the other cameras on this LiDAR have, too.
     """
 
     matrix: FloatArray
     sigmas: Mapping[str, Any]
+    estimated: Mapping[str, Any]
     reasons: tuple[str, ...]
     shared: SharedErrors
 
@@ -92,7 +95,7 @@ def edges_covariance(
     """
     solution = estimate.solution
     # 1. What differs from object to object.
-    steps = _half_sample_steps(problem, estimate, objects)
+    steps, parameter_steps = _half_sample_steps(problem, estimate, objects)
     # 2. What all of them have in common.
     considered = considered_by_matches(
         estimate.robust, solution.pairs, solution.values, solution.state, assumptions
@@ -118,7 +121,18 @@ def edges_covariance(
     shared = SharedErrors(steps, common)
     doubts = {FEW_OBJECTS: shared.estimated < FEWEST, FEW_OUTLINES: outlines is None}
     reasons = tuple(reason for reason, holds in doubts.items() if holds)
-    return EdgesCovariance(total, sigmas | {"samples": shared.estimated}, reasons, shared)
+    sigmas |= {"samples": shared.estimated}
+    return EdgesCovariance(total, sigmas, _estimated(estimate, parameter_steps), reasons, shared)
+
+
+def _estimated(estimate: JointEstimate, steps: Mapping[str, FloatArray]) -> dict[str, Any]:
+    """The parameters of an estimate, their deviations being those of frozen matches and of the steps
+    (SAMPLES,) of the half-samples."""
+    report = estimated_report(estimate.robust, estimate.solution.state)
+    for name, entry in report.items():
+        variance = float(spread_covariance(steps[name][:, None])[0, 0])
+        entry["sigma"] = float(np.hypot(entry["sigma"], np.sqrt(variance)))
+    return report
 
 
 def half_samples() -> BoolArray:
@@ -130,9 +144,11 @@ def half_samples() -> BoolArray:
 
 def _half_sample_steps(
     problem: JointProblem, estimate: JointEstimate, objects: Sequence[Mapping[ObjectId, int]]
-) -> FloatArray:
-    """(SAMPLES, 7) steps from the estimate to those of the half-samples; NaN where matches are too few."""
+) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Steps (SAMPLES, 7) from the estimate to those of the half-samples, and (SAMPLES,) of each parameter;
+    NaN where matches are too few."""
     start, steps = estimate.solution.state, np.full((SAMPLES, 7), np.nan)
+    parameter_steps = {name: np.full(SAMPLES, np.nan) for name in start.nuisances}
     some = [thinned(drive, _POINTS_A_SCAN) for drive in problem.drives]
     for number, kept in enumerate(half_samples()):
         drives = [with_objects(*each, kept) for each in zip(some, objects, strict=True)]
@@ -141,7 +157,9 @@ def _half_sample_steps(
         except EstimationError:
             continue
         steps[number] = difference(start, part.state)
-    return steps
+        for name, values in parameter_steps.items():
+            values[number] = part.state.nuisances[name] - start.nuisances[name]
+    return steps, parameter_steps
 
 
 def _step_without_shallow(problem: JointProblem, start: State) -> FloatArray | None:

@@ -79,7 +79,8 @@ def edges_method(
         (*reasons, *own.reasons, *sweeps.reasons),
         by_static_objects=covariance,
         diagnostics=_diagnostics(solution, contrast, motion)
-        | {"spread": {**own.sigmas, "farther_edges": np.abs(wider_step).tolist()}},
+        | {"spread": {**own.sigmas, "farther_edges": np.abs(wider_step).tolist()}}
+        | {"estimated": dict(own.estimated)},
         by_sweeps=sweeps.covariance,
         sweep_reasons=sweeps.reasons,
         shared=own.shared,
