@@ -41,6 +41,7 @@ K1 = Assumption(
     prevalence=0.5,  # pictures come as they were taken about as often as undistorted
     violation=_VIOLATION,
     remedy=_REMEDY,
+    by_edges=True,
 )
 K2 = Assumption(
     name="k2",

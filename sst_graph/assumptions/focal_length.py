@@ -22,4 +22,5 @@ FOCAL = Assumption(
     span=0.05,
     violation="the focal length does not fit the pictures (share by which it is too short)",
     remedy="check that the camera matrix belongs to this camera, lens setting and image size",
+    by_edges=True,
 )

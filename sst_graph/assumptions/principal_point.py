@@ -27,6 +27,7 @@ CX = Assumption(
     span=30.0,
     violation="the pictures lie beside the principal point cx",
     remedy=_REMEDY,
+    by_edges=True,
 )
 CY = Assumption(
     name="cy",
@@ -37,4 +38,5 @@ CY = Assumption(
     span=30.0,
     violation="the pictures lie beside the principal point cy",
     remedy=_REMEDY,
+    by_edges=True,
 )

@@ -21,7 +21,12 @@ from numpy.typing import NDArray
 from scipy.linalg import hadamard
 
 from sst_graph.assumptions import OF_LIDAR
-from sst_graph.batch.assumption_tests import estimated_report
+from sst_graph.batch.assumption_tests import (
+    ParameterTest,
+    assumption_report,
+    estimated_report,
+    with_test_results,
+)
 from sst_graph.batch.by_edges.parts import thinned, with_objects, without_kind
 from sst_graph.batch.by_edges.positions import considered_positions
 from sst_graph.batch.problem import JointEstimate
@@ -69,13 +74,17 @@ class EdgesCovariance:
     Attributes:
         matrix: (7, 7) of extrinsic and time offset.
         sigmas: of its parts, JSON-able.
-        estimated: value and deviation of the parameters that are unknowns of the estimate, by name, JSON-able.
+        assumptions: what each adds, and the tests of it, as
+            :func:`~sst_graph.batch.assumption_tests.assumption_report`.
+        estimated: value and deviation of the parameters that are unknowns of the estimate, by name,
+            JSON-able.
         reasons: to doubt it.
         shared: what of it the other cameras on this LiDAR have, too.
     """
 
     matrix: FloatArray
     sigmas: Mapping[str, Any]
+    assumptions: Mapping[str, Any]
     estimated: Mapping[str, Any]
     reasons: tuple[str, ...]
     shared: SharedErrors
@@ -86,20 +95,23 @@ def edges_covariance(
     estimate: JointEstimate,
     objects: Sequence[Mapping[ObjectId, int]],
     assumptions: AssumptionConfig,
+    tests: Sequence[ParameterTest] = (),
 ) -> EdgesCovariance:
     """The covariance of extrinsic and time offset.
 
     Args:
         problem: that was solved.
         objects: tracks of each drive's objects.
+        tests: of assumptions; those that the data leave open widen what is considered.
     """
     solution = estimate.solution
     # 1. What differs from object to object.
-    steps, parameter_steps = _half_sample_steps(problem, estimate, objects)
+    steps, parameter_steps = half_sample_steps(problem, solution.state, objects)
     # 2. What all of them have in common.
     considered = considered_by_matches(
         estimate.robust, solution.pairs, solution.values, solution.state, assumptions
     )
+    considered = with_test_results(considered, [each for each in tests if not each.contradicted])
     positions = considered_positions(estimate, problem.config.graph)
     outlines = _step_without_shallow(problem, solution.state)
     parts = {
@@ -122,7 +134,8 @@ def edges_covariance(
     doubts = {FEW_OBJECTS: shared.estimated < FEWEST, FEW_OUTLINES: outlines is None}
     reasons = tuple(reason for reason, holds in doubts.items() if holds)
     sigmas |= {"samples": shared.estimated}
-    return EdgesCovariance(total, sigmas, _estimated(estimate, parameter_steps), reasons, shared)
+    report, estimated = assumption_report(considered, tests), _estimated(estimate, parameter_steps)
+    return EdgesCovariance(total, sigmas, report, estimated, reasons, shared)
 
 
 def _estimated(estimate: JointEstimate, steps: Mapping[str, FloatArray]) -> dict[str, Any]:
@@ -142,12 +155,12 @@ def half_samples() -> BoolArray:
     return np.stack([first, ~first], axis=2).reshape(SAMPLES, -1)
 
 
-def _half_sample_steps(
-    problem: JointProblem, estimate: JointEstimate, objects: Sequence[Mapping[ObjectId, int]]
+def half_sample_steps(
+    problem: JointProblem, start: State, objects: Sequence[Mapping[ObjectId, int]]
 ) -> tuple[FloatArray, dict[str, FloatArray]]:
     """Steps (SAMPLES, 7) from the estimate to those of the half-samples, and (SAMPLES,) of each parameter;
     NaN where matches are too few."""
-    start, steps = estimate.solution.state, np.full((SAMPLES, 7), np.nan)
+    steps = np.full((SAMPLES, 7), np.nan)
     parameter_steps = {name: np.full(SAMPLES, np.nan) for name in start.nuisances}
     some = [thinned(drive, _POINTS_A_SCAN) for drive in problem.drives]
     for number, kept in enumerate(half_samples()):

@@ -10,6 +10,7 @@ import numpy as np
 
 from sst_graph.batch.by_edges.covariance import edges_covariance
 from sst_graph.batch.by_edges.halves import halves_reasons
+from sst_graph.batch.by_edges.lens import examine_lens
 from sst_graph.batch.by_edges.optimum import RESTARTS, best_optimum_steps, refined_steps, starts_steps
 from sst_graph.batch.by_edges.problem import LabelEstimate, edges_problem, motion_alone
 from sst_graph.batch.by_edges.reasons import EdgeContrast, edge_contrast, edges_reasons, wider_kernel_reasons
@@ -55,14 +56,17 @@ def edges_method(
         candidates, begin, restarts = [], labels.state, 0
     # 3. All frames, from the best, and from small turns while one agrees better.
     solution = run_to_end(best_optimum_steps(problem, begin, restarts, progress))
-    # 4. Covariance, with what halves of the objects disagree by, and edges that are farther away.
-    estimate = JointEstimate.of(solution, calibration.objects)
+    # 4. Covariance, with what halves of the objects disagree by, edges that are farther away, and the lens.
+    estimate, assumptions = JointEstimate.of(solution, calibration.objects), calibration.config.assumptions
+    lens = examine_lens(problem.whole, solution.state, calibration.objects, assumptions)
     wider = solve_joint(problem.whole, solution.state, WIDER_KERNEL_PX)
     wider_step = difference(solution.state, wider.state)
-    own = edges_covariance(problem.whole, estimate, calibration.objects, calibration.config.assumptions)
+    own = edges_covariance(problem.whole, estimate, calibration.objects, assumptions, lens.findings)
     covariance = own.matrix + np.outer(wider_step, wider_step)
     sweeps = sweep_effects(calibration, solution, covariance)
     covariance = covariance + sweeps.covariance
+    lens_reasons, remarks = lens.reasons(covariance), lens.remarks(covariance)
+    covariance = covariance + lens.covariance
     # 5. Has it worked?
     contrast = edge_contrast(
         problem.subset_edges, solution.state, [one.state for _, one in candidates], config.seed
@@ -76,11 +80,12 @@ def edges_method(
         solution.state.time_offsets_s[0],
         covariance,
         frames_used(drives, solution),
-        (*reasons, *own.reasons, *sweeps.reasons),
+        (*lens_reasons, *reasons, *own.reasons, *sweeps.reasons),
+        remarks,
         by_static_objects=covariance,
         diagnostics=_diagnostics(solution, contrast, motion)
         | {"spread": {**own.sigmas, "farther_edges": np.abs(wider_step).tolist()}}
-        | {"estimated": dict(own.estimated)},
+        | {"assumptions": dict(own.assumptions), "estimated": dict(own.estimated)},
         by_sweeps=sweeps.covariance,
         sweep_reasons=sweeps.reasons,
         shared=own.shared,

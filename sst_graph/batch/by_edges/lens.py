@@ -1,0 +1,131 @@
+"""The lens tested by edges: focal length, principal point and distortion as further unknowns.
+
+Matches with the picture's edges are soft: they follow a wrong lens, and with the matches frozen hardly
+anything of it shows. So the problem is solved again, and matched again, with these parameters free, all
+together. Their deviations are those of its half-samples (:mod:`sst_graph.batch.by_edges.covariance`), and the
+estimate over its deviation decides (Wald), by Student's t with one degree of freedom less than there are
+half-samples.
+
+A lens that is contradicted is a reason against the estimate where it matters: where the estimate moves
+farther than it is known when the lens is free. Where it moves less far, that step is added to the covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.assumptions import ASSUMPTIONS, named_sigmas
+from sst_graph.batch.assumption_tests import ParameterTest, few_objects_factor
+from sst_graph.batch.by_edges.covariance import half_sample_steps
+from sst_graph.batch.by_edges.optimum import START_KERNELS_PX, newton_ascent_steps
+from sst_graph.covariance.considered import AssumptionConfig
+from sst_graph.covariance.shared_errors import FEWEST
+from sst_graph.errors import EstimationError
+from sst_graph.graph.outer_loop import JointProblem, solve_joint
+from sst_graph.graph.state import State
+from sst_graph.hand_eye.solution import difference
+from sst_graph.objects.tracks import ObjectId
+from sst_graph.stepwise import run_to_end
+
+FloatArray = NDArray[np.float64]
+
+MATTERS_SIGMAS = 2.0
+"""A step longer than this many standard deviations, on any axis, is a reason against an estimate; one that is
+shorter is less than one of the covariance that it is added to. Without this limit the rectified pictures of
+KITTI, which are distorted by a few pixels at the border, would refuse estimates that they move by less than
+0.1 deg and 1 cm."""
+
+
+@dataclass(frozen=True)
+class LensTest:
+    """The parameters of the lens, estimated together.
+
+    Attributes:
+        findings: the most contradicted first; none where nothing was tested.
+        step: (7,) from the estimate to that with the lens free [rad, m, s].
+    """
+
+    findings: tuple[ParameterTest, ...] = ()
+    step: FloatArray | None = None
+
+    @property
+    def contradicted(self) -> tuple[ParameterTest, ...]:
+        """Those that the data contradict."""
+        return tuple(finding for finding in self.findings if finding.contradicted)
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(7, 7) what a contradicted lens adds."""
+        if self.step is None or not self.contradicted:
+            return np.zeros((7, 7))
+        return np.outer(self.step, self.step)
+
+    def reasons(self, covariance: FloatArray) -> tuple[str, ...]:
+        """A sentence where a contradicted lens matters to an estimate of a covariance (7, 7)."""
+        if not self._matters(covariance):
+            return ()
+        first, *others = self.contradicted
+        also = ", ".join(other.assumption.figure(other.value, other.sigma) for other in others)
+        return (first.sentence + (f" (estimated with it: {also})" if also else ""),)
+
+    def remarks(self, covariance: FloatArray) -> tuple[str, ...]:
+        """A sentence where it is contradicted and does not matter."""
+        if not self.contradicted or self._matters(covariance):
+            return ()
+        assert self.step is not None
+        figures = ", ".join(each.assumption.figure(each.value, each.sigma) for each in self.contradicted)
+        degrees, metres = (float(np.linalg.norm(self.step[own])) for own in (slice(0, 3), slice(3, 6)))
+        return (
+            f"the lens is a little off, and the sigmas cover it: {figures}; with the lens free the estimate "
+            f"moves by {np.degrees(degrees):.2f} deg, {100.0 * metres:.1f} cm and {1e3 * self.step[6]:+.1f} ms",
+        )
+
+    def _matters(self, covariance: FloatArray) -> bool:
+        if self.step is None or not self.contradicted:
+            return False
+        return bool((np.abs(self.step) > MATTERS_SIGMAS * np.sqrt(np.diag(covariance))).any())
+
+
+def examine_lens(
+    problem: JointProblem,
+    state: State,
+    objects: Sequence[Mapping[ObjectId, int]],
+    config: AssumptionConfig,
+) -> LensTest:
+    """Estimate the parameters of the lens that are held, and test them.
+
+    Args:
+        problem: that was solved.
+        state: its estimate.
+        objects: tracks of each drive's objects.
+    """
+    graph = problem.config.graph
+    estimated = dict(named_sigmas(graph.estimate))
+    names = [name for name, each in ASSUMPTIONS.items() if each.by_edges and name not in estimated]
+    if not config.test or not names:
+        return LensTest()
+    graph = replace(graph, estimate=(*graph.estimate, *names))
+    free = replace(problem, config=replace(problem.config, graph=graph))
+    start = replace(state, nuisances={**state.nuisances, **dict.fromkeys(names, 0.0)})
+    try:
+        wide = solve_joint(free, start, START_KERNELS_PX)
+        found, _ = run_to_end(newton_ascent_steps(free, wide.state, None))
+    except EstimationError:
+        return LensTest()
+    _, steps = half_sample_steps(free, found, objects)
+    findings = [_finding(name, found.nuisances[name], steps[name], config.threshold) for name in names]
+    known = sorted((each for each in findings if each is not None), key=lambda each: -each.score)
+    return LensTest(tuple(known), difference(state, found))
+
+
+def _finding(name: str, value: float, steps: FloatArray, threshold: float) -> ParameterTest | None:
+    """The test of one parameter by its steps (SAMPLES,); None where too few half-samples have one."""
+    known = steps[np.isfinite(steps)]
+    if len(known) < FEWEST:
+        return None
+    sigma = max(float(known.std(ddof=1)), 1e-12) * few_objects_factor(len(known), threshold)
+    return ParameterTest(ASSUMPTIONS[name], value, sigma, abs(value) > threshold * sigma)
