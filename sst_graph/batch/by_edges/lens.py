@@ -80,8 +80,9 @@ class LensTest:
         figures = ", ".join(each.assumption.figure(each.value, each.sigma) for each in self.contradicted)
         degrees, metres = (float(np.linalg.norm(self.step[own])) for own in (slice(0, 3), slice(3, 6)))
         return (
-            f"the lens is a little off, and the sigmas cover it: {figures}; with the lens free the estimate "
-            f"moves by {np.degrees(degrees):.2f} deg, {100.0 * metres:.1f} cm and {1e3 * self.step[6]:+.1f} ms",
+            f"the lens is a little off, and the sigmas cover it: {figures}; with the lens free the "
+            f"estimate moves by {np.degrees(degrees):.2f} deg, {100.0 * metres:.1f} cm and "
+            f"{1e3 * self.step[6]:+.1f} ms",
         )
 
     def _matters(self, covariance: FloatArray) -> bool:
