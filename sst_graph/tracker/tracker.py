@@ -24,6 +24,7 @@ from sst_graph.tracker.marginal import TrackedMarginal, increment, tracked_margi
 from sst_graph.tracker.monitor.monitor import Monitor
 from sst_graph.tracker.monitor.statistic import ComparedEstimate
 from sst_graph.tracker.result import tracker_result
+from sst_graph.tracker.start.first_estimate import Guess
 from sst_graph.tracker.start.initializer import (
     NUMERICAL_ERRORS,
     Initialization,
@@ -31,7 +32,6 @@ from sst_graph.tracker.start.initializer import (
     Restart,
     searched_scans,
 )
-from sst_graph.tracker.start.solution import Guess
 from sst_graph.tracker.storage.checkpoint import Saver, load_checkpoint
 from sst_graph.tracker.storage.resume import Setup
 from sst_graph.tracker.storage.snapshot import Snapshot

@@ -13,7 +13,8 @@ from sst_graph.files.object_store import stored
 from sst_graph.simulator import SimulatedDrive
 from sst_graph.stepwise import Stepwise, run_to_end
 from sst_graph.tracker.start.initializer import _Run
-from sst_graph.tracker.start.solution import Guess, first_estimate_steps
+from sst_graph.tracker.start.first_estimate import Guess
+from sst_graph.tracker.start.solution import first_estimate_steps
 from sst_graph.tracker.storage.snapshot import Snapshot
 from sst_graph.types import Frame
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from sst_graph.batch.by_edges.covariance import NEAR_KERNELS_PX
 from sst_graph.batch.by_edges.problem import EdgesProblem
+from sst_graph.batch.by_edges.reasons import SCORE_WORK
 from sst_graph.drive.preparation import Progress
 from sst_graph.edges.agreement import score
 from sst_graph.edges.search import edge_starts_steps, turned
@@ -53,8 +54,6 @@ _CONVERGED_STEP = np.array([*np.radians([0.02] * 3), 0.005, 0.005, 0.005, 0.003]
 """(7,) a round that moves by no more is the last [rad, m, s]."""
 _EDGES_WORK = 2
 """How many times the work of an outer iteration with contours one with edges of pictures is."""
-_SCORE_WORK = 5
-"""A score of some scans, in units of work."""
 
 
 def starts_steps(problem: EdgesProblem) -> Stepwise[list[State]]:
@@ -83,12 +82,12 @@ def refined_steps(
     found, failures = [], []
     for start in starts:
         try:
-            solution = yield from _solution(problem.some, start, START_KERNELS_PX)
+            solution = yield from solution_steps(problem.some, start, START_KERNELS_PX)
         except EstimationError as error:
             failures.append(error)
             continue
         found.append((score(problem.subset_edges, solution.state, SCORE_PX), solution))
-        yield _SCORE_WORK
+        yield SCORE_WORK
     if not found:
         raise failures[0]
     return sorted(found, key=lambda pair: -pair[0])
@@ -102,7 +101,7 @@ def best_optimum_steps(
     Raises:
         EstimationError: too few matches.
     """
-    wide = yield from _solution(problem.whole, start, KERNELS_PX, progress)
+    wide = yield from solution_steps(problem.whole, start, KERNELS_PX, progress)
     best, best_score = yield from _newton_ascent(problem.whole, wide.state, progress)
     for _ in range(restarts):
         other = yield from _better_nearby(problem, best)
@@ -115,7 +114,7 @@ def best_optimum_steps(
     return (yield from _converged(problem.whole, best, progress))
 
 
-def _solution(
+def solution_steps(
     problem: JointProblem, start: State, kernels_px: Sequence[float], progress: Progress | None = None
 ) -> Stepwise[JointSolution]:
     """As :func:`~sst_graph.graph.outer_loop.solve_joint_steps`, with the work of edges."""
@@ -156,10 +155,10 @@ def _newton_ascent(
     edges = edges_of(problem.drives, problem.tracks, graph)
     state, found_score = start, 0.0
     for _ in range(_MAX_ROUNDS):
-        solution = yield from _solution(by_peaks, state, NEAR_KERNELS_PX, progress)
+        solution = yield from solution_steps(by_peaks, state, NEAR_KERNELS_PX, progress)
         state = solution.state
         before, found_score = found_score, score(edges, state, SCORE_PX)
-        yield _SCORE_WORK
+        yield SCORE_WORK
         if found_score < _GAIN * before:
             break
     return state, found_score
@@ -173,7 +172,7 @@ def _converged(problem: JointProblem, start: State, progress: Progress | None) -
     """
     state = start
     for _ in range(_MAX_ROUNDS):
-        solution = yield from _solution(problem, state, NEAR_KERNELS_PX, progress)
+        solution = yield from solution_steps(problem, state, NEAR_KERNELS_PX, progress)
         if (np.abs(difference(state, solution.state)) < _CONVERGED_STEP).all():
             break
         state = solution.state

@@ -8,8 +8,8 @@ from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.estimate import FrameMatches, OnlineEstimate
 from sst_graph.tracker.monitor.adoption import Adoption
 from sst_graph.tracker.monitor.change_detector import ChangeDetector
+from sst_graph.tracker.start.first_estimate import Guess
 from sst_graph.tracker.start.initializer import Restart
-from sst_graph.tracker.start.solution import Guess
 from sst_graph.tracker.window.matcher import WindowMatcher
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.association.edge_matching import SIDES
-from sst_graph.assumptions import ASSUMPTIONS, held_at_zero, named_sigmas
+from sst_graph.assumptions import ASSUMPTIONS, named_sigmas
 from sst_graph.covariance.error_model import ErrorModel
 from sst_graph.covariance.jackknife import composed
 from sst_graph.errors import EstimationError
@@ -29,6 +29,7 @@ from sst_graph.graph.state import (
     twist_key,
 )
 from sst_graph.tracker.config import DriftConfig
+from sst_graph.tracker.sums.held import held_names
 from sst_graph.tracker.sums.running_sums import RunningSums
 from sst_graph.tracker.window.epochs import Epoch, EpochSums, MatchedPair, RetiredEpoch
 from sst_graph.tracker.window.gaussian import Gaussian, Point, insert_point
@@ -90,7 +91,7 @@ class WindowSmoother:
     ) -> None:
         """prior: of the first epoch."""
         self.classes, self.graph, self.drift = tuple(classes), graph, drift
-        self.held_names = held_at_zero(graph.estimate)
+        self.held_names = held_names(graph.estimate, classes)
         self.prior = self.static = prior
         self.past = self.observed = prior.holding(len(self.held_names))
         self.sums = RunningSums.empty(prior.point.size, len(self.held_names))
