@@ -2,8 +2,8 @@
 
 As in the batch (:mod:`sst_graph.batch.by_edges.reasons`), the score of the estimate must stand out from those
 of random rotations around it, and the estimate must stay where it is when edges farther away are met. How far
-it moves then, and without upper edges that may be no outline, is a deviation of its covariance. Both steps are
-one Newton step of the window and all that has left it.
+it moves then, and without upper edges that may be no outline, is a deviation of its covariance. Both steps
+are one Newton step of the window and all that has left it.
 """
 
 from __future__ import annotations
@@ -186,7 +186,7 @@ class _Review:
         past = smoother.past.without_held()
         new = {track: place for track, place in places.items() if track not in past.point.tracks}
         past = past.with_objects(new, smoother.graph.object_bias_sigma_px)
-        seen = [pair.information for pair in pairs]
+        seen = [pair.information.without_held() for pair in pairs]
         return np.asarray((scaled_inverse(past.information_with(seen)) @ past.vector_with(seen))[:7])
 
 

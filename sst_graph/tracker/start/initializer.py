@@ -311,7 +311,9 @@ class Initializer:
         found = {scan: one for scan, one in initial.found.items() if scan >= window.first_scan}
         stamps = window.stamps_ns()
         start_ns = min(stamps[scan] for scan in initial.chosen if scan in stamps)
-        smoother = WindowSmoother(prior, start_ns, matcher.classes, graph, config.drift)
+        # Far from where they were made, edges would have no weight.
+        begin = None if initial.first.known is None else initial.first.point
+        smoother = WindowSmoother(prior, start_ns, matcher.classes, graph, config.drift, begin)
         smoother.update(found, set(), window.first_scan, window.objects.live)
         return Initialization(smoother, Uncertainty.of(smoother), len(initial.chosen), initial.first)
 

@@ -3,8 +3,8 @@ share.
 
 Edges err together in ways that no choice of them shows (:mod:`sst_graph.batch.by_edges.covariance`): where
 they lie between the beams, and a floor that no part of the model explains. Each is a parameter held at 0, in
-units of its deviation. What it does to the estimate follows the share that edges have in it: none where labels
-decide.
+units of its deviation. What it does to the estimate follows the share that edges have in it: none where
+labels decide.
 """
 
 from __future__ import annotations
