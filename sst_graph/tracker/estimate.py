@@ -20,7 +20,7 @@ from sst_graph.graph.outer_loop import NARROW_KERNELS_PX
 from sst_graph.odometry.sweep import SweepDecision
 from sst_graph.tracker.assumption_tests import AssumptionTests
 from sst_graph.tracker.by_edges.kinds import by_edges
-from sst_graph.tracker.by_edges.review import EdgeReviews
+from sst_graph.tracker.by_edges.reviews import EdgeReviews
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.history import History, HistoryEntry
 from sst_graph.tracker.monitor.statistic import ComparedEstimate
@@ -99,14 +99,14 @@ class OnlineEstimate:
         self.past_epochs = History()
         self.starts = 0
         self.sweep: SweepDecision | None = None
-        self.edges = EdgeReviews(config.calibration.seed) if by_edges(matcher.classes) else None
+        self.edges = EdgeReviews(config) if by_edges(matcher.classes) else None
 
     def begin(self, initialization: Initialization) -> None:
         """Go on from a first estimate."""
         smoother, window = initialization.smoother, self.matcher.window
         self.smoother, self.uncertainty = smoother, initialization.uncertainty
         if self.edges is not None:
-            self.edges.begin(window.next_scan, initialization.first.farther)
+            self.edges.begin(window.next_scan, initialization.first)
         self.tests.run(smoother)
         self.starts += 1
         soon = len(window.scans) + initialization.scans
@@ -180,15 +180,19 @@ class OnlineEstimate:
         """(7, 7) covariance by what no choice of the matches shows: assumptions, and what all edges have in
         common."""
         considered = self.considered().covariance(7)
-        if self.edges is None:
+        if self.edges is None or self.smoother is None:
             return considered
-        steps = self.uncertainty.edge_steps
-        return np.asarray(considered + steps.T @ steps + self.edges.covariance)
+        return considered + self.edges.covariance(self.smoother, self.uncertainty)
+
+    def catch_up(self) -> None:
+        """Repeat the work that a stored review had done."""
+        if self.edges is not None:
+            self.edges.catch_up()
 
     @property
     def doubts(self) -> tuple[str, ...]:
         """Why the estimate may be wrong altogether."""
-        return () if self.edges is None else self.edges.reasons
+        return () if self.edges is None else self.edges.doubts(self.uncertainty)
 
     def by_sweep(self) -> SweepEffect:
         """The effect of a sweep that the scans leave undecided.

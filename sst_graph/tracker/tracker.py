@@ -24,9 +24,9 @@ from sst_graph.tracker.marginal import TrackedMarginal, increment, tracked_margi
 from sst_graph.tracker.monitor.monitor import Monitor
 from sst_graph.tracker.monitor.statistic import ComparedEstimate
 from sst_graph.tracker.result import tracker_result
+from sst_graph.tracker.spread_work import NUMERICAL_ERRORS
 from sst_graph.tracker.start.first_estimate import Guess
 from sst_graph.tracker.start.initializer import (
-    NUMERICAL_ERRORS,
     Initialization,
     Initializer,
     Restart,

@@ -13,6 +13,7 @@ from sst_graph.batch.by_edges.halves import halves_reasons
 from sst_graph.batch.by_edges.optimum import RESTARTS, best_optimum_steps, refined_steps, starts_steps
 from sst_graph.batch.by_edges.problem import LabelEstimate, edges_problem, motion_alone
 from sst_graph.batch.by_edges.reasons import EdgeContrast, edge_contrast, edges_reasons, wider_kernel_reasons
+from sst_graph.batch.by_edges.solution import WIDER_KERNEL_PX
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import Guess, MethodEstimate, frames_used
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
@@ -21,10 +22,6 @@ from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.graph.outer_loop import JointSolution, solve_joint
 from sst_graph.hand_eye.solution import MotionSolution, difference
 from sst_graph.stepwise import run_to_end
-
-WIDER_KERNEL_PX = (3.0,)
-"""Scale of the kernel under which an estimate is solved once more [px]: where it moves, it hangs on which of
-several edges nearby are met, and the step is a deviation of its covariance."""
 
 
 def edges_method(

@@ -10,15 +10,15 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from sst_graph.batch.by_edges.covariance import NEAR_KERNELS_PX
 from sst_graph.batch.by_edges.problem import EdgesProblem
 from sst_graph.batch.by_edges.reasons import SCORE_WORK
+from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX, solution_steps
 from sst_graph.drive.preparation import Progress
 from sst_graph.edges.agreement import score
 from sst_graph.edges.search import edge_starts_steps, turned
 from sst_graph.errors import EstimationError
 from sst_graph.graph.matching import edges_of
-from sst_graph.graph.outer_loop import JointProblem, JointSolution, solve_joint_steps
+from sst_graph.graph.outer_loop import JointProblem, JointSolution
 from sst_graph.graph.state import State
 from sst_graph.hand_eye.solution import difference
 from sst_graph.stepwise import Stepwise
@@ -52,8 +52,6 @@ _MAX_ROUNDS = 10
 """Most times that the near scales are gone through."""
 _CONVERGED_STEP = np.array([*np.radians([0.02] * 3), 0.005, 0.005, 0.005, 0.003])
 """(7,) a round that moves by no more is the last [rad, m, s]."""
-_EDGES_WORK = 2
-"""How many times the work of an outer iteration with contours one with edges of pictures is."""
 
 
 def starts_steps(problem: EdgesProblem) -> Stepwise[list[State]]:
@@ -112,20 +110,6 @@ def best_optimum_steps(
             break
         best, best_score = again, found_score
     return (yield from _converged(problem.whole, best, progress))
-
-
-def solution_steps(
-    problem: JointProblem, start: State, kernels_px: Sequence[float], progress: Progress | None = None
-) -> Stepwise[JointSolution]:
-    """As :func:`~sst_graph.graph.outer_loop.solve_joint_steps`, with the work of edges."""
-    steps = solve_joint_steps(problem, start, kernels_px, progress)
-    while True:
-        try:
-            work = next(steps)
-        except StopIteration as stop:
-            solution: JointSolution = stop.value
-            return solution
-        yield _EDGES_WORK * work
 
 
 def _better_nearby(problem: EdgesProblem, state: State) -> Stepwise[State | None]:

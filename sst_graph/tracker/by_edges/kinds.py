@@ -27,20 +27,24 @@ def by_labels(classes: Collection[SemanticClass]) -> bool:
 
 
 def both_kinds(scan: ScanFeatures) -> ScanFeatures:
-    """A scan with its labelled objects and, beside them, those without a class, no more of their edges than
-    are matched."""
-    edges, c = scan.by_geometry, SemanticClass.OBJECT
-    if edges is not None:
-        own = np.flatnonzero(edges.classes == int(c))
-        scan = dataclasses.replace(
-            scan,
-            boundaries={**scan.boundaries, **edges.boundaries},
-            lPs=np.concatenate([scan.lPs, edges.lPs[own]]),
-            classes=np.concatenate([scan.classes, edges.classes[own]]),
-            offsets_s=np.concatenate([scan.offsets_s, edges.offsets_s[own]]),
-            by_geometry=None,
-        )
-    return thinned_scan(scan, POINTS_A_SCAN, (c,))
+    """A scan with its labelled objects and, beside them, those without a class."""
+    edges = scan.by_geometry
+    if edges is None:
+        return scan
+    own = np.flatnonzero(edges.classes == int(SemanticClass.OBJECT))
+    return dataclasses.replace(
+        scan,
+        boundaries={**scan.boundaries, **edges.boundaries},
+        lPs=np.concatenate([scan.lPs, edges.lPs[own]]),
+        classes=np.concatenate([scan.classes, edges.classes[own]]),
+        offsets_s=np.concatenate([scan.offsets_s, edges.offsets_s[own]]),
+        by_geometry=None,
+    )
+
+
+def thinned_edges(scan: ScanFeatures) -> ScanFeatures:
+    """A scan with no more boundary points of objects without a class than are matched."""
+    return thinned_scan(scan, POINTS_A_SCAN, (SemanticClass.OBJECT,))
 
 
 def of_kind(drive: Drive, edges: bool) -> Drive:

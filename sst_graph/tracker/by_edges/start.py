@@ -7,12 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from sst_graph.batch.by_edges.method import WIDER_KERNEL_PX
 from sst_graph.batch.by_edges.optimum import (
     RESTARTS,
     best_optimum_steps,
     refined_steps,
-    solution_steps,
     starts_steps,
 )
 from sst_graph.batch.by_edges.problem import (
@@ -20,14 +18,14 @@ from sst_graph.batch.by_edges.problem import (
     edges_problem,
     motion_alone,
 )
-from sst_graph.batch.by_edges.reasons import edge_contrast_steps, edges_reasons, wider_kernel_reasons
+from sst_graph.batch.by_edges.reasons import edge_contrast_steps, edges_reasons
 from sst_graph.batch.method_estimate import Guess as BatchGuess
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.errors import EstimationError
 from sst_graph.graph.building import Tracks
 from sst_graph.graph.state import State
-from sst_graph.hand_eye.solution import difference
 from sst_graph.stepwise import Stepwise
+from sst_graph.tracker.by_edges.review import EdgeReview, review_steps
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.start.first_estimate import FirstEstimate, Guess, Stretch
 from sst_graph.tracker.window.gaussian import Point
@@ -58,17 +56,17 @@ def first_edge_estimate_steps(
     starts = yield from starts_steps(problem)
     candidates = yield from refined_steps(problem, starts)
     solution = yield from best_optimum_steps(problem, candidates[0][1].state, RESTARTS)
-    # 3. Has it worked?
+    # 3. Has it worked, and by how much may it be off?
     state = solution.state
     others = [one.state for _, one in candidates]
     contrast = yield from edge_contrast_steps(problem.subset_edges, state, others, calibration.seed)
-    wider = yield from solution_steps(problem.whole, state, WIDER_KERNEL_PX)
-    farther = difference(state, wider.state)
     reasons = edges_reasons(solution, contrast, motion, np.diag(_START_SIGMAS**2), problem.centre)
-    reasons += wider_kernel_reasons(farther)
-    if reasons:
+    if stretch.at_end:
+        return FirstEstimate(_point(state, config), problem.known, EdgeReview(reasons))
+    review = yield from review_steps(problem.whole, state, stretch.tracks, calibration.seed)
+    if reasons := tuple(dict.fromkeys((*reasons, *review.reasons))):
         raise EstimationError("; ".join(reasons))
-    return FirstEstimate(_point(state, config), problem.known, farther)
+    return FirstEstimate(_point(state, config), problem.known, review)
 
 
 def _point(state: State, config: TrackerConfig) -> Point:

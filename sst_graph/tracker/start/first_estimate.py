@@ -6,17 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import gtsam
-import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.batch.by_edges.problem import KnownCalibration
 from sst_graph.drive.preparation import Drive
 from sst_graph.objects.dynamic_objects import DynamicObject
 from sst_graph.objects.tracks import ObjectId
+from sst_graph.tracker.by_edges.review import EdgeReview
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.types import SemanticClass
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -46,11 +43,13 @@ class Stretch:
         drive: with their images and motions.
         tracks: of their objects.
         dynamic: those that move.
+        at_end: all that there is: the estimate is reviewed after it.
     """
 
     drive: Drive
     tracks: Mapping[ObjectId, int] = field(default_factory=dict)
     dynamic: Mapping[ObjectId, DynamicObject] = field(default_factory=dict)
+    at_end: bool = False
 
 
 @dataclass(frozen=True)
@@ -60,9 +59,9 @@ class FirstEstimate:
     Attributes:
         point: of all unknowns.
         known: what is known beside the matches; None: the weak priors around the guess alone.
-        farther: (7,) step of the estimate by edges farther away; zeros without edges.
+        review: what a review of edges has found; nothing without edges.
     """
 
     point: Point
     known: KnownCalibration | None = None
-    farther: FloatArray = field(default_factory=lambda: np.zeros(7))
+    review: EdgeReview = field(default_factory=EdgeReview)

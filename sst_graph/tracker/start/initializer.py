@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from sst_graph.batch.lower_edges import LowerEdgeSupport
-from sst_graph.errors import SstGraphError
-from sst_graph.factors.errors import FactorError
-from sst_graph.stepwise import Stepwise
 from sst_graph.tracker.by_edges.kinds import by_edges
 from sst_graph.tracker.config import TrackerConfig
+from sst_graph.tracker.spread_work import NUMERICAL_ERRORS, Run
 from sst_graph.tracker.start.first_estimate import FirstEstimate, Guess, Stretch
 from sst_graph.tracker.start.solution import prior_gaussian
 from sst_graph.tracker.start.steps import start_steps
@@ -23,16 +19,6 @@ from sst_graph.tracker.window.epochs import MatchedPair
 from sst_graph.tracker.window.matcher import WindowMatcher
 from sst_graph.tracker.window.smoother import WindowSmoother
 from sst_graph.tracker.window.window import Window
-
-NUMERICAL_ERRORS = (
-    SstGraphError,
-    FactorError,
-    RuntimeError,
-    ValueError,
-    ArithmeticError,
-    np.linalg.LinAlgError,
-)
-"""Errors that may come from the data; all others are errors of the program."""
 
 _WORK_PER_FRAME = 36
 """Work on a start with each frame, in units of 4 ms: the estimate comes when all is done, some frames
@@ -90,38 +76,6 @@ class Initialization:
     first: FirstEstimate
 
 
-class _Run:
-    """A first estimate that is being computed. A failed frame does not roll it back: its result is returned
-    only once the requested work has reached the work done.
-    """
-
-    rolls_back = False
-
-    def __init__(self, steps: Stepwise[FirstEstimate]) -> None:
-        self._steps = steps
-        self._done = 0
-        self._answer: FirstEstimate | Exception | None = None
-
-    def until(self, work: int | None) -> FirstEstimate | None:
-        """The estimate, if it takes no more work than this in all (None: any).
-
-        Raises:
-            EstimationError: it has none; or another of :data:`NUMERICAL_ERRORS`.
-        """
-        while self._answer is None and (work is None or self._done < work):
-            try:
-                self._done += next(self._steps)
-            except StopIteration as stop:
-                self._answer = stop.value
-            except NUMERICAL_ERRORS as error:
-                self._answer = error
-        if self._answer is None or (work is not None and self._done >= work):
-            return None
-        if isinstance(self._answer, Exception):
-            raise self._answer
-        return self._answer
-
-
 class Search:
     """A batch solution of some scans that is being computed.
 
@@ -135,7 +89,7 @@ class Search:
     def __init__(self, stretch: Stretch, numbers: Sequence[int], guess: Guess, config: TrackerConfig) -> None:
         self.stretch, self.numbers, self.guess, self.config = stretch, tuple(numbers), guess, config
         self.work = 0
-        self._run: _Run | None = None
+        self._run: Run[FirstEstimate] | None = None
 
     def advance(self, work: int | None) -> FirstEstimate | None:
         """Do more work (None: all that is left); the estimate, once it is complete.
@@ -145,7 +99,7 @@ class Search:
         """
         if self._run is None:
             # A search that was stored is done again as far as it had come: the steps are the same.
-            self._run = _Run(start_steps(self.stretch, self.guess, self.config))
+            self._run = Run(start_steps(self.stretch, self.guess, self.config))
         self.work += work or 0
         return self._run.until(None if work is None else self.work)
 
@@ -253,6 +207,7 @@ class Initializer:
             search = self.search or self._search(window)
             if by_edges(self.config.calibration.classes):
                 # There are other optima: the whole window tells them apart better.
+                window.dynamics.test_all()
                 search = self._search(window, whole=True)
             try:
                 first = search.advance(None)
@@ -273,14 +228,10 @@ class Initializer:
 
     def _search(self, window: Window, whole: bool = False) -> Search:
         """Over the latest scans, no more than twice as many as are needed: a step's work grows with them; or
-        over the whole window."""
-        drive, numbers = window.drive()
-        most = len(numbers) if whole else 2 * self.needed
-        scans, numbers = drive.scans[-most:], numbers[-most:]
-        motions = tuple(m for m in drive.lidar_motions if m.from_ns >= scans[0].stamp_ns)
-        drive = replace(drive, scans=scans, lidar_motions=motions)
+        over the whole window, as at the end of a drive."""
+        drive, numbers = window.latest(len(window.scans) if whole else 2 * self.needed)
         found = window.objects_of(numbers) if window.edges else ({}, {})
-        return Search(Stretch(drive, *found), numbers, self.guess, self.config)
+        return Search(Stretch(drive, *found, at_end=whole), numbers, self.guess, self.config)
 
     def _begin_graph(self, window: Window, first: FirstEstimate, searched: Sequence[int]) -> None:
         """Begin with the graph of the scans that an estimate was made of.

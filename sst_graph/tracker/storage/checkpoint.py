@@ -264,6 +264,7 @@ def load_checkpoint(
         _check_tracker(_tracker(document, data, path), path)
         tracker = _tracker(document, data, path)
         tracker.initializer.catch_up()
+        tracker.estimate.catch_up()
     if setup is not None:
         check_setup(tracker, setup, path)
     if sweep is not None:

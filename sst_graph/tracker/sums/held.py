@@ -2,9 +2,9 @@
 share.
 
 Edges err together in ways that no choice of them shows (:mod:`sst_graph.batch.by_edges.covariance`): where
-they lie between the beams, and a floor that no part of the model explains. Each is a parameter held at 0, in
-units of its deviation. What it does to the estimate follows the share that edges have in it: none where
-labels decide.
+they lie between the beams, in units of its deviation, and shifts of the calibration as they see it. Each is a
+parameter held at 0. What it does to the estimate follows the share that edges have in it: none where labels
+decide.
 """
 
 from __future__ import annotations
@@ -16,17 +16,14 @@ from numpy.typing import NDArray
 
 from sst_graph.association.edge_matching import MatchConfig, SilhouetteMatches
 from sst_graph.assumptions import held_at_zero
-from sst_graph.batch.by_edges.covariance import FLOOR
 from sst_graph.batch.by_edges.positions import POSITIONS, position_columns
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
 
-_FLOORS = np.flatnonzero(FLOOR)
-EDGE_ERRORS = (
-    *(f"edges_{name}" for name in POSITIONS),
-    *(f"edges_floor_{axis}" for axis in _FLOORS.tolist()),
-)
+SHIFTS = tuple(f"edges_shift_{axis}" for axis in range(7))
+"""Shifts of extrinsic and time offset as all edges see them [rad, m, s]."""
+EDGE_ERRORS = (*POSITIONS, *SHIFTS)
 """Errors that all edges share."""
 
 
@@ -46,4 +43,4 @@ def edge_error_columns(J: FloatArray, matches: SilhouetteMatches, config: MatchC
         J: (m, 14) of the weighted residuals by [rot, trans, offset, twist, bias].
     """
     beams = position_columns(matches.sides, matches.alignment.sigmas_px, config)
-    return np.column_stack([beams * J[:, 13:14], J[:, _FLOORS] * FLOOR[_FLOORS]])
+    return np.column_stack([beams * J[:, 13:14], J[:, :7]])

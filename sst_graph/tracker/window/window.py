@@ -17,7 +17,7 @@ from sst_graph.objects.dynamic_objects import DynamicObject, DynamicObjectTest, 
 from sst_graph.objects.occupancy import ObjectName
 from sst_graph.objects.tracks import ObjectId, ObjectTracker
 from sst_graph.odometry.visual import ImagePair
-from sst_graph.tracker.by_edges.kinds import both_kinds, by_edges, by_labels
+from sst_graph.tracker.by_edges.kinds import both_kinds, by_edges, by_labels, thinned_edges
 from sst_graph.types import RelativeMotion, SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -120,7 +120,7 @@ class Window:
         lean = dataclasses.replace(
             features, depth_lPs=features.depth_lPs[:0], depth_offsets_s=features.depth_offsets_s[:0]
         )
-        self.scans.append((number, lean))
+        self.scans.append((number, thinned_edges(lean) if self.edges else lean))
         self._thin_out()
         self.tracks[number] = self.objects.add(features.boundaries, self.wTl)
         self.dynamics.add(number, lean, self.tracks[number], self.wTl, self.first_scan)
@@ -151,6 +151,13 @@ class Window:
         weights = dynamic_object_weights(speeds, np.array([tau_s]), reach_m).tolist()
         lost = [(c, name, round(10.0 * (1.0 - w))) for (c, name), w in zip(found, weights, strict=True)]
         return frozenset(entry for entry in lost if entry[2] > 0)
+
+    def latest(self, most: int) -> tuple[Drive, list[int]]:
+        """The last scans as a drive, and their numbers."""
+        drive, numbers = self.drive()
+        scans, numbers = drive.scans[-most:], numbers[-most:]
+        motions = tuple(m for m in drive.lidar_motions if m.from_ns >= scans[0].stamp_ns)
+        return dataclasses.replace(drive, scans=scans, lidar_motions=motions), numbers
 
     def objects_of(self, numbers: Sequence[int]) -> tuple[dict[ObjectId, int], dict[ObjectId, DynamicObject]]:
         """Tracks of the objects of some scans, and the dynamic ones, by the scan's position."""
