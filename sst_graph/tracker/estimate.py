@@ -20,6 +20,7 @@ from sst_graph.graph.outer_loop import NARROW_KERNELS_PX
 from sst_graph.odometry.sweep import SweepDecision
 from sst_graph.tracker.assumption_tests import AssumptionTests
 from sst_graph.tracker.by_edges.kinds import by_edges
+from sst_graph.tracker.by_edges.review import softness
 from sst_graph.tracker.by_edges.reviews import EdgeReviews
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.history import History, HistoryEntry
@@ -188,6 +189,11 @@ class OnlineEstimate:
         """Repeat the work that a stored review had done."""
         if self.edges is not None:
             self.edges.catch_up()
+
+    @property
+    def softness(self) -> float:
+        """Of the matches (:func:`~sst_graph.tracker.by_edges.review.softness`)."""
+        return 1.0 if self.edges is None else softness(self.edges.found, self.covariance)
 
     @property
     def doubts(self) -> tuple[str, ...]:

@@ -72,3 +72,15 @@ def review_steps(
     known = np.isfinite(halves).all(axis=1).any()
     spread = spread_covariance(halves) if known else np.zeros((7, 7))
     return EdgeReview(reasons, spread, np.asarray(farther))
+
+
+def softness(review: EdgeReview, covariance: FloatArray) -> float:
+    """How many times the variance of an estimate by edges is that by frozen matches, on average; 1 without
+    edges.
+
+    Args:
+        covariance: (m, m) by frozen matches, extrinsic and time offset first.
+    """
+    if not review.spread.any():
+        return 1.0
+    return 1.0 + float(np.trace(np.linalg.solve(covariance[:7, :7], review.spread))) / 7.0

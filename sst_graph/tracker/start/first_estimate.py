@@ -60,8 +60,10 @@ class FirstEstimate:
         point: of all unknowns.
         known: what is known beside the matches; None: the weak priors around the guess alone.
         review: what a review of edges has found; nothing without edges.
+        reviewed: False where it is still to come.
     """
 
     point: Point
     known: KnownCalibration | None = None
     review: EdgeReview = field(default_factory=EdgeReview)
+    reviewed: bool = True

@@ -9,6 +9,7 @@ from typing import Any
 
 from sst_graph.batch.lower_edges import LowerEdgeSupport
 from sst_graph.tracker.by_edges.kinds import by_edges
+from sst_graph.tracker.by_edges.review import softness
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.spread_work import NUMERICAL_ERRORS, Run
 from sst_graph.tracker.start.first_estimate import FirstEstimate, Guess, Stretch
@@ -74,6 +75,11 @@ class Initialization:
     uncertainty: Uncertainty
     scans: int
     first: FirstEstimate
+
+    @property
+    def softness(self) -> float:
+        """Of its matches (:func:`~sst_graph.tracker.by_edges.review.softness`)."""
+        return softness(self.first.review, self.uncertainty.covariance)
 
 
 class Search:
