@@ -159,7 +159,7 @@ class Tracker:
         at_end = not self.estimate.exists and self._finish_start()
         converged = self.estimate.optimize(max_iterations)
         self.monitor.changes.statistic.softness = self.estimate.softness
-        if converged is not None and at_end:
+        if converged is not None and (at_end or self.estimate.edges is not None):
             self.monitor.check_start_at_end(self.estimate)
         return dataclasses.replace(current_update(self, self.last_update), converged=converged)
 

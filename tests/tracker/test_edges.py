@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -190,3 +191,57 @@ def test_a_doubt_is_a_status() -> None:
     assert tracker.estimate.doubts == ("the pose may be wrong altogether",)
     result = tracker.result()
     assert result.status == "not_converged" and "the pose may be wrong altogether" in result.reasons[0]
+
+
+def test_a_checkpoint_before_the_start_goes_on_alike(tmp_path: Path) -> None:
+    """Gradients of pictures and what images show of motion are stored, too."""
+    street = simulated(TRACKED_STREET)
+    whole = Tracker(street.camera, config("edges"), street.truth.cTl)
+    for position in range(3):
+        whole.add(without_labels(street[position]))
+    whole.save(tmp_path / "tracker.npz")
+    again = Tracker.load(tmp_path / "tracker.npz", whole.setup)
+    for tracker in (whole, again):
+        tracker.add(without_labels(street[3]))
+    (drive, _), (other, _) = whole.inputs.window.drive(), again.inputs.window.drive()
+    assert len(drive.image_pairs) == len(other.image_pairs) == 3
+    for one, two in zip(drive.image_pairs, other.image_pairs, strict=True):
+        assert one.direction.rotation.equals(two.direction.rotation, 1e-12)
+        np.testing.assert_array_equal(one.tracks.uv_b, two.tracks.uv_b)
+    for image, stored_image in zip(drive.images, other.images, strict=True):
+        gradients, stored_gradients = image.contours[OBJECT], stored_image.contours[OBJECT]
+        assert isinstance(gradients, PictureGradients) and isinstance(stored_gradients, PictureGradients)
+        np.testing.assert_array_equal(gradients.strengths, stored_gradients.strengths)
+
+
+def test_a_checkpoint_with_a_review_under_way(tmp_path: Path) -> None:
+    """What had been done of it is done again: both are at the same step."""
+    tracker = begun("edges", 0)
+    edges, smoother = tracker.estimate.edges, tracker.estimate.smoother
+    assert edges is not None and smoother is not None
+    edges.next = 0
+    edges.advance(tracker.matcher, smoother, None)
+    assert edges.review is not None and edges.review.work > 0
+    tracker.save(tmp_path / "tracker.npz")
+    again = Tracker.load(tmp_path / "tracker.npz").estimate.edges
+    assert again is not None and again.review is not None
+    assert again.review.work == edges.review.work
+    found = [each.review.advance(None) for each in (edges, again)]  # type: ignore[union-attr]
+    np.testing.assert_allclose(found[0].spread, found[1].spread, rtol=1e-6, atol=1e-12)  # type: ignore[union-attr]
+    assert found[0].reasons == found[1].reasons  # type: ignore[union-attr]
+
+
+def test_a_frame_that_cannot_be_used_changes_nothing() -> None:
+    tracker = begun("edges", 0)
+    street = simulated(TRACKED_STREET)
+    frame = without_labels(street[FRAMES])
+    assert frame.image is not None and frame.scan is not None
+    before = tracker.estimate.point
+    wrong = dataclasses.replace(frame.image, pixels=frame.image.pixels[:10])
+    update = tracker.add_image(wrong)
+    assert not update.accepted and update.refused == ("image",)
+    dark = dataclasses.replace(frame.image, pixels=np.zeros_like(frame.image.pixels))
+    assert tracker.add_image(dark).accepted
+    tracker.add_scan(frame.scan)
+    step = before.cTl.localCoordinates(tracker.estimate.point.cTl)
+    assert np.isfinite(step).all() and np.degrees(np.linalg.norm(step[:3])) < 0.5
