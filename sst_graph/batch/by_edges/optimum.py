@@ -50,7 +50,7 @@ _GAIN = 1.001
 """A round that raises the score by less than this factor is the last, where only scores are compared."""
 _MAX_ROUNDS = 10
 """Most times that the near scales are gone through."""
-_CONVERGED_STEP = np.array([*np.radians([0.02] * 3), 0.005, 0.005, 0.005, 0.003])
+CONVERGED_STEP = np.array([*np.radians([0.02] * 3), 0.005, 0.005, 0.005, 0.003])
 """(7,) a round that moves by no more is the last [rad, m, s]."""
 
 
@@ -157,7 +157,7 @@ def _converged(problem: JointProblem, start: State, progress: Progress | None) -
     state = start
     for _ in range(_MAX_ROUNDS):
         solution = yield from solution_steps(problem, state, NEAR_KERNELS_PX, progress)
-        if (np.abs(difference(state, solution.state)) < _CONVERGED_STEP).all():
+        if (np.abs(difference(state, solution.state)) < CONVERGED_STEP).all():
             break
         state = solution.state
     return solution
