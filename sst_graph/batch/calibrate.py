@@ -40,7 +40,7 @@ from sst_graph.batch.total_covariance import total_covariance
 from sst_graph.config import expect_settings
 from sst_graph.covariance.considered import BUDGET
 from sst_graph.drive.geometric_labels import GeometricallyLabelled
-from sst_graph.drive.preparation import Drive, PrepareConfig, Progress, prepare_drive
+from sst_graph.drive.preparation import TRACK_INTERVAL_S, Drive, PrepareConfig, Progress, prepare_drive
 from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.odometry.sweep import with_sweep
 from sst_graph.result import CalibrationResult
@@ -119,7 +119,7 @@ def preparation_of(config: CalibrationConfig) -> PrepareConfig:
     if config.method not in _NEED_IMAGE_TRACKS and not may_use_motion(config):
         prepare = replace(prepare, use_visual_odometry=False)
     if config.method not in _NEED_DEPTH:
-        prepare = replace(prepare, track_interval_s=_TRACK_INTERVAL_S)
+        prepare = replace(prepare, track_interval_s=TRACK_INTERVAL_S)
     return prepare
 
 
@@ -242,8 +242,5 @@ _METHODS: dict[Method, _Method] = {
 }
 _NEED_IMAGE_TRACKS = ("paper", "static", "motion", "edges", "both")
 """Methods whose camera velocity comes from visual odometry."""
-_TRACK_INTERVAL_S = 0.07
-"""Shortest motion of the camera that is compared with the LiDAR's [s]: the rotation between two images is
-known as well after 33 ms as after 100 ms, the rate of turn is not."""
 _NEED_DEPTH = ("paper", "static")
 """Methods that take the metric scale of that velocity from LiDAR points."""

@@ -43,7 +43,8 @@ class CalibrationConfig(Settings):
         doc="What estimates: auto (joint where both sensors have labels, both where one of several drives "
         "has none, else edges), joint (outlines of labelled objects), edges (LiDAR edges against pictures, "
         "no labels), both (joint where frames have labels, edges in the others), motion (LiDAR against "
-        "visual odometry, no labels), paper (SST-Calib as printed), static (its first stage), semalign.",
+        "visual odometry, no labels), paper (SST-Calib as printed), static (its first stage), semalign. "
+        "track knows joint, edges and both; auto is edges there where the drive has no labels.",
     )
     classes: tuple[SemanticClass, ...] = setting(
         (SemanticClass.VEHICLE,),

@@ -41,6 +41,9 @@ SAMPLE_POINTS = 3000
 """Most labelled points of a scan that are kept for search and checks, of each class."""
 _SAMPLE_NEAR_M, _FAR_M = 2.0, 60.0
 """Ranges between which points are kept [m]."""
+TRACK_INTERVAL_S = 0.07
+"""Shortest motion of the camera that is compared with the LiDAR's [s]: the rotation between two images is
+known as well after 33 ms as after 100 ms, the rate of turn is not."""
 DENSE_SHARE = 0.8
 """Images are dense where their period is a smaller share of the scans' than this: stamps of equal rates
 differ by some per cent."""

@@ -90,6 +90,7 @@ _FAMILIES: tuple[tuple[type, str], ...] = (
     (np.generic, "scalar"),
     (np.ndarray, "array"),
     (gtsam.Pose3, "pose"),
+    (gtsam.Rot3, "rotation"),
     (cKDTree, "tree"),
 )
 """How values of these classes, and of those derived from them, are stored; all others by their attributes."""
@@ -339,6 +340,9 @@ class _Writer:
     def _pose(self, value: gtsam.Pose3) -> list[Node]:
         return ["pose", self.node(np.asarray(value.matrix()))]
 
+    def _rotation(self, value: gtsam.Rot3) -> list[Node]:
+        return ["rotation", self.node(np.asarray(value.matrix()))]
+
     def _tree(self, value: cKDTree) -> list[Node]:
         return ["tree", self.node(np.asarray(value.data))]
 
@@ -387,6 +391,7 @@ class _Reader:
             "deque": self._deque,
             "dict": self._dict,
             "pose": self._pose,
+            "rotation": self._rotation,
             "tree": self._tree,
             "object": self._object,
         }
@@ -492,12 +497,17 @@ class _Reader:
         T = self.value(node)
         if not (isinstance(T, np.ndarray) and T.shape == (4, 4) and np.isfinite(T).all()):
             raise ValueError("a pose that is no finite 4x4 matrix")
-        R = np.clip(T[:3, :3], -2.0, 2.0)  # so that the product does not overflow
-        if np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(R) < 0.0:
+        if not _is_rotation(T[:3, :3]):
             raise ValueError("a pose whose rotation is none")
         if (T[3] != (0.0, 0.0, 0.0, 1.0)).any():
             raise ValueError(f"a pose with the last row {T[3].tolist()}")
         return self._keep(number, gtsam.Pose3(T))
+
+    def _rotation(self, node: Node, number: int) -> gtsam.Rot3:
+        R = self.value(node)
+        if not (isinstance(R, np.ndarray) and R.shape == (3, 3) and np.isfinite(R).all() and _is_rotation(R)):
+            raise ValueError("a rotation that is none")
+        return self._keep(number, gtsam.Rot3(R))
 
     def _tree(self, node: Node, number: int) -> cKDTree:
         points = self.value(node)
@@ -575,3 +585,9 @@ def _state(value: object) -> Mapping[str, Any]:
         for name, one in vars(value).items()
         if not isinstance(getattr(type(value), name, None), cached_property)
     }
+
+
+def _is_rotation(R: NDArray[np.float64]) -> bool:
+    """Whether a finite (3, 3) matrix is one."""
+    R = np.clip(R, -2.0, 2.0)  # so that the product does not overflow
+    return bool(np.abs(R @ R.T - np.eye(3)).max() <= _ROTATION_TOLERANCE and np.linalg.det(R) >= 0.0)

@@ -43,15 +43,16 @@ def score_findings(smoother: WindowSmoother, config: AssumptionConfig) -> tuple[
     A = np.concatenate([follows, np.eye(smoother.past.held)])
     score, information = A.T @ g, np.einsum("nk,nm,mk->k", A, H, A)
     excess = np.einsum("nk,nm,mk->k", A, smoother.excess(with_held=True), A)
-    before = np.array([ASSUMPTIONS[name].span ** -2.0 for name in smoother.held_names])
+    spans = {name: assumption.span for name, assumption in ASSUMPTIONS.items()}
+    before = np.array([spans.get(name, 1.0) ** -2.0 for name in smoother.held_names])
     curvature = np.maximum(information, 0.0) / bounded_ratio(smoother.weight_curvature_ratio) + before
     values = score / curvature
     sigmas = np.sqrt(np.maximum(information + excess, 0.0) + before) / curvature
     sigmas *= few_objects_factor(smoother.objects, config.threshold)
     found = []
     for place, name in enumerate(smoother.held_names):
-        assumption = ASSUMPTIONS[name]
-        if not assumption.by_matches:
+        assumption = ASSUMPTIONS.get(name)
+        if assumption is None or not assumption.by_matches:
             continue
         value, sigma = float(values[place]), float(sigmas[place])
         contradicted = abs(value) > config.threshold * sigma

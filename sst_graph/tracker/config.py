@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.config import Settings, setting
+from sst_graph.types import SemanticClass
 
 
 @dataclass(frozen=True)
@@ -103,8 +104,14 @@ class TrackerConfig(Settings):
 
     @property
     def estimating(self) -> TrackerConfig:
-        """The same with a variable in the graph for each assumption that is to be estimated."""
-        return replace(self, calibration=self.calibration.estimating)
+        """The same with a variable in the graph for each assumption that is to be estimated, and with objects
+        without a class among the classes where edges are aligned."""
+        calibration = self.calibration.estimating
+        if calibration.method == "edges":
+            calibration = replace(calibration, classes=(SemanticClass.OBJECT,), lower_edges="never")
+        elif calibration.method == "both":
+            calibration = replace(calibration, classes=(*calibration.classes, SemanticClass.OBJECT))
+        return replace(self, calibration=calibration)
 
     def __post_init__(self) -> None:
         self.expect_at_least("window", self.start_scans, "start_scans")

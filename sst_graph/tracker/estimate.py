@@ -19,11 +19,14 @@ from sst_graph.errors import EstimationError
 from sst_graph.graph.outer_loop import NARROW_KERNELS_PX
 from sst_graph.odometry.sweep import SweepDecision
 from sst_graph.tracker.assumption_tests import AssumptionTests
+from sst_graph.tracker.by_edges.kinds import by_edges
+from sst_graph.tracker.by_edges.review import softness
+from sst_graph.tracker.by_edges.reviews import EdgeReviews
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.history import History, HistoryEntry
 from sst_graph.tracker.monitor.statistic import ComparedEstimate
+from sst_graph.tracker.start.first_estimate import Guess
 from sst_graph.tracker.start.initializer import Initialization
-from sst_graph.tracker.start.solution import Guess
 from sst_graph.tracker.uncertainty import Uncertainty
 from sst_graph.tracker.window.epochs import MatchedPair
 from sst_graph.tracker.window.gaussian import Point
@@ -82,6 +85,7 @@ class OnlineEstimate:
         past_epochs: those that have left the window (drift mode).
         starts: number of the start that the estimate comes from.
         sweep: what was decided of the sweep of the scans; None: nothing, they are used as they come.
+        edges: reviews of the estimate where edges are aligned.
     """
 
     def __init__(self, matcher: WindowMatcher, config: TrackerConfig, guess: Guess) -> None:
@@ -96,11 +100,14 @@ class OnlineEstimate:
         self.past_epochs = History()
         self.starts = 0
         self.sweep: SweepDecision | None = None
+        self.edges = EdgeReviews(config) if by_edges(matcher.classes) else None
 
     def begin(self, initialization: Initialization) -> None:
         """Go on from a first estimate."""
         smoother, window = initialization.smoother, self.matcher.window
         self.smoother, self.uncertainty = smoother, initialization.uncertainty
+        if self.edges is not None:
+            self.edges.begin(window.next_scan, initialization.first)
         self.tests.run(smoother)
         self.starts += 1
         soon = len(window.scans) + initialization.scans
@@ -116,6 +123,8 @@ class OnlineEstimate:
         self.stop_relinearization()
         self.smoother, self.uncertainty = None, Uncertainty.nothing()
         self.tests.restart()
+        if self.edges is not None:
+            self.edges.restart()
         self.entered.clear()
         self.past_epochs.cut()
 
@@ -166,7 +175,30 @@ class OnlineEstimate:
         return self._without_sweep() + self.by_sweep().covariance
 
     def _without_sweep(self) -> FloatArray:
-        return self.covariance[:7, :7] + self.considered().covariance(7)
+        return self.covariance[:7, :7] + self._shared()
+
+    def _shared(self) -> FloatArray:
+        """(7, 7) covariance by what no choice of the matches shows: assumptions, and what all edges have in
+        common."""
+        considered = self.considered().covariance(7)
+        if self.edges is None or self.smoother is None:
+            return considered
+        return considered + self.edges.covariance(self.smoother, self.uncertainty)
+
+    def catch_up(self) -> None:
+        """Repeat the work that a stored review had done."""
+        if self.edges is not None:
+            self.edges.catch_up()
+
+    @property
+    def softness(self) -> float:
+        """Of the matches (:func:`~sst_graph.tracker.by_edges.review.softness`)."""
+        return 1.0 if self.edges is None else softness(self.edges.found, self.covariance)
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Why the estimate may be wrong altogether."""
+        return () if self.edges is None else self.edges.doubts(self.uncertainty)
 
     def by_sweep(self) -> SweepEffect:
         """The effect of a sweep that the scans leave undecided.
@@ -195,7 +227,7 @@ class OnlineEstimate:
         if self.smoother is None:
             return []
         entries = self.past_epochs.smoothed(self.smoother)
-        extra = self.considered().covariance(7) + self.by_sweep().covariance
+        extra = self._shared() + self.by_sweep().covariance
         return [dataclasses.replace(entry, covariance=entry.covariance + extra) for entry in entries]
 
     # ------------------------------------------------------------------ a frame
@@ -230,8 +262,10 @@ class OnlineEstimate:
         self.uncertainty = Uncertainty.of(smoother)
         if new:
             self.information_log.add(matches.scan, self.reported_covariance())
-        # 4. Test the assumptions.
+        # 4. Test the assumptions, and whether edges still agree with the pictures.
         self.tests.update(matches.scan, smoother)
+        if self.edges is not None:
+            self.edges.advance(self.matcher, smoother, self.guess.cTl)
         self.past_epochs.take(smoother)
 
     def begin_relinearization(self) -> None:
@@ -282,6 +316,8 @@ class OnlineEstimate:
             )
             self.uncertainty = Uncertainty.of(smoother)
             self.tests.run(smoother)
+            if self.edges is not None:
+                self.edges.finish(self.matcher, smoother, self.guess.cTl)
         except EstimationError as error:
             _LOG.warning("tracker: the window as a whole could not be solved: %s", error)
             return None

@@ -6,11 +6,16 @@ import dataclasses
 from collections import deque
 from typing import Any
 
-from sst_graph.drive.preparation import image_features, scan_features
+from sst_graph.drive.geometric_labels import labelled_by_geometry
+from sst_graph.drive.preparation import TRACK_INTERVAL_S, image_features, scan_features
 from sst_graph.drive.stamp_intervals import Jump, StampMonitor
 from sst_graph.factors.camera import PinholeCamera
+from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.lidar import LidarOdometry
+from sst_graph.odometry.relative import relative_pose
+from sst_graph.odometry.visual import ImagePair
 from sst_graph.tracker.admission import StampOrder, check_lateness
+from sst_graph.tracker.by_edges.kinds import by_edges
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.estimate import OnlineEstimate
 from sst_graph.tracker.storage.resume import FirstFrames
@@ -20,6 +25,8 @@ from sst_graph.validation import checked_image, checked_scan
 
 _MAX_IMAGES = 600
 """Most images that are kept, for any number of them may come while no scan does: a minute at 10 Hz."""
+_MAX_EDGE_IMAGES = 100
+"""The same where edges are aligned: the gradients of a picture take 8.5 bytes a pixel."""
 _MAX_FAILURES = 10
 """Failures in a row after which the window is given up: it is then their likely cause."""
 _SEARCH_MARGIN_S = 1.0
@@ -43,7 +50,7 @@ class SensorInputs:
     def __init__(self, camera: PinholeCamera, config: TrackerConfig, searched_scans: int) -> None:
         """searched_scans: latest scans that a start may be made of."""
         self.camera, self.config = camera, config
-        self.window = Window(camera, config.window, searched_scans)
+        self.window = Window(camera, config.window, searched_scans, config.calibration.classes)
         self.image_order, self.scan_order = StampOrder("image", True), StampOrder("scan", False)
         self.first_frames = FirstFrames()
         self.last_scan: Scan | None = None
@@ -62,6 +69,7 @@ class SensorInputs:
     def _restart_motion(self) -> None:
         self.odometry = LidarOdometry(self.config.calibration.lidar_odometry)
         self.stamps = StampMonitor(self.config.alarm.chi2)
+        self.image_features = FeatureTracker()
 
     def check_image(self, image: CameraImage) -> tuple[CameraImage, int]:
         """The image as it may be used, and by how much its clock was set, 0 if it was not [ns].
@@ -94,7 +102,7 @@ class SensorInputs:
         self.stamps.add_image(image.stamp_ns, self.window.place)
         calibration = self.config.calibration
         features = image_features(self.window.next_image, image, calibration.classes, calibration.image_edges)
-        self.window.add_image(features)
+        self.window.add_image(features, self._image_motion(image, estimate))
         self._forget_images(estimate)
         self.first_frames.add(image)
 
@@ -107,16 +115,28 @@ class SensorInputs:
         calibration = self.config.calibration
         prepare = dataclasses.replace(calibration.prepare, use_visual_odometry=False)
         used = calibration.lower_edges != "never"
+        by_geometry = calibration.method == "edges"
+        labelled = labelled_by_geometry(scan) if by_geometry else scan
         features = scan_features(
-            self.window.next_scan, scan, calibration.classes, prepare, with_lower_edges=used
+            self.window.next_scan, labelled, calibration.classes, prepare, with_lower_edges=used
         )
-        self.window.add_scan(features, self.odometry.add(scan))
+        self.window.add_scan(features, self.odometry.add(labelled))
         self.last_scan = scan
         self._forget_images(estimate)
         self.first_frames.add(scan)
         self.failures.clear()
         alarm = self.config.alarm
         return jump if alarm.enabled and alarm.stamps else None
+
+    def _image_motion(self, image: CameraImage, estimate: OnlineEstimate) -> ImagePair | None:
+        """What an image shows of the camera's motion: a start by edges needs it, nothing else does."""
+        if not by_edges(self.config.calibration.classes) or estimate.exists:
+            self.image_features = FeatureTracker()
+            return None
+        if self.image_features.seconds_to(image) < TRACK_INTERVAL_S:
+            return None
+        tracks = self.image_features.add(image)
+        return None if tracks is None else ImagePair(tracks, relative_pose(tracks, self.camera))
 
     def failed(self, why: str) -> bool:
         """Note why a scan or an image could not be used; whether that has gone on for too long."""
@@ -127,4 +147,5 @@ class SensorInputs:
         """Drop the images that no scan, present or to come, can be paired with."""
         margin_s = self.config.late_s + max(0.0, estimate.point.time_offset_s)
         margin_s += 0.0 if estimate.exists else _SEARCH_MARGIN_S
-        self.window.forget_images(round(1e9 * margin_s), _MAX_IMAGES)
+        most = _MAX_EDGE_IMAGES if by_edges(self.config.calibration.classes) else _MAX_IMAGES
+        self.window.forget_images(round(1e9 * margin_s), most)

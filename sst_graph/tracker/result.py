@@ -50,7 +50,7 @@ def tracker_result(
         weak_directions=last.weak_directions,
         frames_used=tuple(used),
         method="track",
-        config=to_dict(config),
+        config=to_dict(tracker.setup.config),
         initial=guess.cTl,
         initial_time_offset_s=guess.time_offset_s,
         diagnostics={

@@ -24,14 +24,14 @@ from sst_graph.tracker.marginal import TrackedMarginal, increment, tracked_margi
 from sst_graph.tracker.monitor.monitor import Monitor
 from sst_graph.tracker.monitor.statistic import ComparedEstimate
 from sst_graph.tracker.result import tracker_result
+from sst_graph.tracker.spread_work import NUMERICAL_ERRORS
+from sst_graph.tracker.start.first_estimate import Guess
 from sst_graph.tracker.start.initializer import (
-    NUMERICAL_ERRORS,
     Initialization,
     Initializer,
     Restart,
     searched_scans,
 )
-from sst_graph.tracker.start.solution import Guess
 from sst_graph.tracker.storage.checkpoint import Saver, load_checkpoint
 from sst_graph.tracker.storage.resume import Setup
 from sst_graph.tracker.storage.snapshot import Snapshot
@@ -139,6 +139,7 @@ class Tracker:
                     return self._restart(change, checked.stamp_ns)
                 # 7. Add the matches to the graph, and estimate.
                 self.estimate.update(matches)
+                self.monitor.changes.statistic.softness = self.estimate.softness
                 # 8. Check the start against later frames; adopt the estimate where held-out frames agree.
                 return self._review(matches, checked.stamp_ns, chi2)
         except Exception as error:
@@ -157,7 +158,8 @@ class Tracker:
         """
         at_end = not self.estimate.exists and self._finish_start()
         converged = self.estimate.optimize(max_iterations)
-        if converged is not None and at_end:
+        self.monitor.changes.statistic.softness = self.estimate.softness
+        if converged is not None and (at_end or self.estimate.edges is not None):
             self.monitor.check_start_at_end(self.estimate)
         return dataclasses.replace(current_update(self, self.last_update), converged=converged)
 
@@ -271,7 +273,11 @@ class Tracker:
         """Go on from a first estimate, if the frames that it is made of agree with it."""
         smoother, window = initialization.smoother, self.inputs.window
         estimate = ComparedEstimate(smoother.point, initialization.uncertainty.joint, smoother.model)
-        if why := self.monitor.changes.check_start(list(smoother.entries), estimate):
+        self.monitor.changes.statistic.softness = initialization.softness
+        why = ""
+        if initialization.first.reviewed:
+            why = self.monitor.changes.check_start(list(smoother.entries), estimate)
+        if why:
             return self._restart(Restart(self.initializer.guess, len(window.scans) // 2, why), stamp_ns)
         self.estimate.begin(initialization)
         self.initializer.succeeded()

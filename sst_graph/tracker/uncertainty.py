@@ -8,10 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.batch.by_edges.positions import POSITIONS
 from sst_graph.covariance.considered import steps_by
 from sst_graph.errors import EstimationError
 from sst_graph.graph.linear import scaled_inverse
 from sst_graph.tracker.monitor.statistic import EstimateCovariance
+from sst_graph.tracker.sums.held import EDGE_ERRORS, SHIFTS
 from sst_graph.tracker.track_update import UNKNOWN_SIGMAS
 from sst_graph.tracker.window.smoother import WindowSmoother
 
@@ -27,13 +29,19 @@ class Uncertainty:
         inflation: how much larger it is than that of independent matches.
         by_static_objects: (7, 7) covariance of extrinsic and offset by static objects alone; None where no
             object moves.
-        steps: (7,) derivative of extrinsic and offset by each parameter that is held at 0, by name.
+        steps: (7,) derivative of extrinsic and offset by each parameter of an assumption that is held at 0,
+            by name.
+        edge_steps: (k, 7) step of extrinsic and offset by one deviation of where edges lie between the beams.
+        edge_share: (7, k) how extrinsic and offset follow a shift of them as all edges see it; k is 7, or 0
+            without edges.
     """
 
     joint: EstimateCovariance
     inflation: float = 1.0
     by_static_objects: FloatArray | None = None
     steps: Mapping[str, FloatArray] = field(default_factory=dict)
+    edge_steps: FloatArray = field(default_factory=lambda: np.zeros((0, 7)))
+    edge_share: FloatArray = field(default_factory=lambda: np.zeros((7, 0)))
 
     @classmethod
     def nothing(cls) -> Uncertainty:
@@ -59,9 +67,19 @@ class Uncertainty:
         if static is not None:
             wider = scaled_inverse(static)[:7, :7] - naive[:7, :7]
             by_static_objects = matrix[:7, :7] + inflation * wider
-        steps = steps_by(smoother.held_names, naive, information[: len(naive), len(naive) :], 7)
+        held = steps_by(smoother.held_names, naive, information[: len(naive), len(naive) :], 7)
+        steps = {name: step for name, step in held.items() if name not in EDGE_ERRORS}
+        positions = np.array([held[name] for name in POSITIONS if name in held]).reshape(-1, 7)
+        share = np.array([-held[name] for name in SHIFTS if name in held]).reshape(-1, 7).T
         joint = EstimateCovariance(matrix, smoother.past.point.tracks, m)
-        return cls(joint, inflation, by_static_objects, steps)
+        return cls(
+            joint,
+            inflation,
+            by_static_objects,
+            steps,
+            positions,
+            share,
+        )
 
     @property
     def covariance(self) -> FloatArray:

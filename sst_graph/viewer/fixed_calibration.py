@@ -10,7 +10,7 @@ import gtsam
 from sst_graph.batch import CalibrationConfig
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.tracker.config import TrackerConfig
-from sst_graph.tracker.start.initializer import NUMERICAL_ERRORS
+from sst_graph.tracker.spread_work import NUMERICAL_ERRORS
 from sst_graph.tracker.tracker import Tracker
 from sst_graph.types import Frame, SemanticClass
 from sst_graph.viewer.frame_view import FrameView, FrameViews

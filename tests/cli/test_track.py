@@ -192,3 +192,45 @@ def test_bad_options(
     assert main(["track", str(street), *options]) == 2
     captured = capsys.readouterr()
     assert captured.out == "" and captured.err.count("\n") == 1 and message in captured.err
+
+
+@pytest.fixture(scope="module")
+def unlabelled(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same drive without its labels."""
+    bare = tmp_path_factory.mktemp("bare") / "sequences" / "00"
+    bare.mkdir(parents=True)
+    stored = street / "sequences" / "00"
+    for part in stored.iterdir():
+        if not any(word in part.name for word in ("label", "semantic", "instance")):
+            (bare / part.name).symlink_to(part)
+    return bare.parents[1]
+
+
+@pytest.mark.parametrize("options", [[], ["--method", "auto"], ["--method", "edges"]])
+def test_a_drive_without_labels_is_tracked_by_edges(
+    unlabelled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str]
+) -> None:
+    """Four frames make no start: the last line and the file say so alike."""
+    out, checkpoint = tmp_path / "calibration.json", tmp_path / "tracker.npz"
+    command = ["track", str(unlabelled), *options, "--checkpoint", str(checkpoint)]
+    assert main([*command, "--frames", "0:4", "--out", str(out)]) == 3
+    lines = _lines(capsys.readouterr().out)
+    assert [line["status"] for line in lines] == ["starting"] * 4
+    result = read_result(out)
+    assert result.config["calibration"]["method"] == "edges" and result.status == "not_converged"
+    np.testing.assert_array_equal(lines[-1]["T_camera_lidar"], result.T_camera_lidar.matrix())
+    # Resumed without the option, the method is the checkpoint's.
+    assert main([*command, "--frames", "0:5", "--resume"]) == 3
+    assert [line["frame"] for line in _lines(capsys.readouterr().out)] == [4]
+    assert main(["track", str(unlabelled), "--method", "joint", *command[-2:], "--resume"]) == 2
+    assert "method" in capsys.readouterr().err
+
+
+def test_where_there_are_labels_auto_stays_as_it_is(
+    street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "calibration.json"
+    main(["track", str(street), "--frames", "0:2", "--out", str(out)])
+    assert read_result(out).config["calibration"]["method"] == "auto"
+    assert main(["track", str(street), "--method", "paper"]) == 2
+    assert "invalid choice" in capsys.readouterr().err

@@ -157,6 +157,17 @@ def test_what_is_one_thing_stays_one() -> None:
     assert found[2].equals(pose, 1e-15)
 
 
+def test_a_rotation() -> None:
+    R = gtsam.Rot3.Ypr(0.1, 0.2, 0.3)
+    assert _again([R])[0].equals(R, 1e-15)
+    for wrong in (np.ones((3, 3)), np.eye(4), np.diag([1.0, 1.0, -1.0]), np.full((3, 3), np.nan)):
+        node, data = stored(R), b""
+        node, data = stored([wrong])
+        node = ["rotation", node[1][0], 0]
+        with pytest.raises(ValueError, match="rotation"):
+            restored(node, memoryview(data), checkpoint_classes())
+
+
 def test_objects_of_the_package() -> None:
     point = Point.unbiased(gtsam.Pose3(), 0.1, (VEHICLE,))
     found = _again({"a": point, "config": TrackerConfig(window=17), "kernel": RobustKernel("huber", 2.0)})

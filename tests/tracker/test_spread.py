@@ -12,8 +12,9 @@ from sst_graph.errors import EstimationError
 from sst_graph.files.object_store import stored
 from sst_graph.simulator import SimulatedDrive
 from sst_graph.stepwise import Stepwise, run_to_end
-from sst_graph.tracker.start.initializer import _Run
-from sst_graph.tracker.start.solution import Guess, first_estimate_steps
+from sst_graph.tracker.spread_work import Run
+from sst_graph.tracker.start.first_estimate import Guess
+from sst_graph.tracker.start.solution import first_estimate_steps
 from sst_graph.tracker.storage.snapshot import Snapshot
 from sst_graph.types import Frame
 
@@ -107,9 +108,9 @@ def test_the_estimate_is_returned_when_its_work_is_requested() -> None:
             yield 2
         return 7
 
-    run = _Run(counting())  # type: ignore[arg-type]
+    run = Run(counting())  # type: ignore[arg-type]
     assert [run.until(work) for work in (4, 10, 3, 11, 10)] == [None, None, None, 7, None]
-    assert _Run(counting()).until(None) == 7 == run_to_end(counting())  # type: ignore[arg-type]
+    assert Run(counting()).until(None) == 7 == run_to_end(counting())  # type: ignore[arg-type]
 
 
 def test_a_failure_is_raised_each_time() -> None:
@@ -117,7 +118,7 @@ def test_a_failure_is_raised_each_time() -> None:
         yield 1
         raise EstimationError("nothing to see")
 
-    run = _Run(failing())  # type: ignore[arg-type]
+    run = Run(failing())  # type: ignore[arg-type]
     assert run.until(1) is None
     for _ in range(2):
         with pytest.raises(EstimationError, match="nothing to see"):

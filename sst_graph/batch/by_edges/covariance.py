@@ -29,15 +29,17 @@ from sst_graph.batch.assumption_tests import (
 )
 from sst_graph.batch.by_edges.parts import thinned, with_objects, without_kind
 from sst_graph.batch.by_edges.positions import considered_positions
+from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX, solution_steps
 from sst_graph.batch.problem import JointEstimate
 from sst_graph.covariance.considered import AssumptionConfig, considered_by_matches
 from sst_graph.covariance.shared_errors import FEWEST, SharedErrors, spread_covariance
 from sst_graph.errors import EstimationError
 from sst_graph.features.lidar_edges import Edge
-from sst_graph.graph.outer_loop import JointProblem, solve_joint
+from sst_graph.graph.outer_loop import JointProblem
 from sst_graph.graph.state import State
 from sst_graph.hand_eye.solution import difference
 from sst_graph.objects.tracks import ObjectId
+from sst_graph.stepwise import Stepwise, run_to_end
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -50,8 +52,6 @@ SAMPLES = 16
 """Half-samples: the order of a Hadamard matrix."""
 _PAIRS = SAMPLES - 1
 """Pairs of groups of objects, of which each half-sample has one group: each column but the constant one."""
-NEAR_KERNELS_PX = (3.0, 2.0, 2.0, 1.5, 1.2)
-"""Scales of the kernel from the estimate [px]: wide enough to meet other edges, too narrow to leave it."""
 _POINTS_A_SCAN = 500
 """Most boundary points of a scan before half of the objects are taken: each edge keeps some."""
 _STEP_SIGMAS = 0.5
@@ -106,14 +106,14 @@ def edges_covariance(
     """
     solution = estimate.solution
     # 1. What differs from object to object.
-    steps, parameter_steps = half_sample_steps(problem, solution.state, objects)
+    steps, parameter_steps = run_to_end(half_sample_steps(problem, solution.state, objects))
     # 2. What all of them have in common.
     considered = considered_by_matches(
         estimate.robust, solution.pairs, solution.values, solution.state, assumptions
     )
     considered = with_test_results(considered, [each for each in tests if not each.contradicted])
     positions = considered_positions(estimate, problem.config.graph)
-    outlines = _step_without_shallow(problem, solution.state)
+    outlines = run_to_end(outline_steps(problem, solution.state))
     parts = {
         "matches": estimate.covariance[:7, :7],
         "objects": spread_covariance(steps),
@@ -131,11 +131,9 @@ def edges_covariance(
     if outlines is not None:
         common["shallow"] = outlines
     shared = SharedErrors(steps, common)
-    doubts = {FEW_OBJECTS: shared.estimated < FEWEST, FEW_OUTLINES: outlines is None}
-    reasons = tuple(reason for reason, holds in doubts.items() if holds)
     sigmas |= {"samples": shared.estimated}
     report, estimated = assumption_report(considered, tests), _estimated(estimate, parameter_steps)
-    return EdgesCovariance(total, sigmas, report, estimated, reasons, shared)
+    return EdgesCovariance(total, sigmas, report, estimated, few_edges(steps, outlines), shared)
 
 
 def _estimated(estimate: JointEstimate, steps: Mapping[str, FloatArray]) -> dict[str, Any]:
@@ -148,6 +146,18 @@ def _estimated(estimate: JointEstimate, steps: Mapping[str, FloatArray]) -> dict
     return report
 
 
+def few_edges(steps: FloatArray, outlines: FloatArray | None) -> tuple[str, ...]:
+    """Why a covariance cannot be told.
+
+    Args:
+        steps: of the half-samples.
+        outlines: step without upper edges that may be no outline, or None.
+    """
+    known = int(np.isfinite(steps).all(axis=1).sum())
+    doubts = {FEW_OBJECTS: known < FEWEST, FEW_OUTLINES: outlines is None}
+    return tuple(reason for reason, holds in doubts.items() if holds)
+
+
 def half_samples() -> BoolArray:
     """(SAMPLES, 2 _PAIRS) which groups of objects each half-sample has: one of each pair, all pairs of groups
     equally often together."""
@@ -157,16 +167,17 @@ def half_samples() -> BoolArray:
 
 def half_sample_steps(
     problem: JointProblem, start: State, objects: Sequence[Mapping[ObjectId, int]]
-) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Steps (SAMPLES, 7) from the estimate to those of the half-samples, and (SAMPLES,) of each parameter;
-    NaN where matches are too few."""
+) -> Stepwise[tuple[FloatArray, dict[str, FloatArray]]]:
+    """Steps (SAMPLES, 7) from the estimate to those of the half-samples, and (SAMPLES,) of each parameter of
+    an assumption; NaN where matches are too few."""
     steps = np.full((SAMPLES, 7), np.nan)
     parameter_steps = {name: np.full(SAMPLES, np.nan) for name in start.nuisances}
     some = [thinned(drive, _POINTS_A_SCAN) for drive in problem.drives]
     for number, kept in enumerate(half_samples()):
         drives = [with_objects(*each, kept) for each in zip(some, objects, strict=True)]
         try:
-            part = solve_joint(replace(problem, drives=drives), start, NEAR_KERNELS_PX, None, _STEP_SIGMAS)
+            half = replace(problem, drives=drives)
+            part = yield from solution_steps(half, start, NEAR_KERNELS_PX, None, _STEP_SIGMAS)
         except EstimationError:
             continue
         steps[number] = difference(start, part.state)
@@ -175,7 +186,7 @@ def half_sample_steps(
     return steps, parameter_steps
 
 
-def _step_without_shallow(problem: JointProblem, start: State) -> FloatArray | None:
+def outline_steps(problem: JointProblem, start: State) -> Stepwise[FloatArray | None]:
     """(7,) step of the estimate where upper edges that may be no outline are left out.
 
     A surface that goes on in the ring above ends somewhere else than its edge is taken to be, on all objects
@@ -183,7 +194,8 @@ def _step_without_shallow(problem: JointProblem, start: State) -> FloatArray | N
     """
     drives = [without_kind(drive, Edge.SHALLOW_TOP) for drive in problem.drives]
     try:
-        part = solve_joint(replace(problem, drives=drives), start, NEAR_KERNELS_PX, None, _STEP_SIGMAS)
+        others = replace(problem, drives=drives)
+        part = yield from solution_steps(others, start, NEAR_KERNELS_PX, None, _STEP_SIGMAS)
     except EstimationError:
         return None
     return difference(start, part.state)

@@ -13,8 +13,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.batch.by_edges.covariance import NEAR_KERNELS_PX, SAMPLES
+from sst_graph.batch.by_edges.covariance import SAMPLES
 from sst_graph.batch.by_edges.reasons import MIN_OVER_OTHER
+from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX
 from sst_graph.batch.contradictions import FALSE_ALARM
 from sst_graph.covariance.contradiction import Difference, PartEstimate, name_step
 from sst_graph.edges.agreement import score

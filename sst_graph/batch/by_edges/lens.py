@@ -22,14 +22,15 @@ from sst_graph.assumptions import ASSUMPTIONS, named_sigmas
 from sst_graph.batch.assumption_tests import ParameterTest, few_objects_factor
 from sst_graph.batch.by_edges.covariance import half_sample_steps
 from sst_graph.batch.by_edges.optimum import START_KERNELS_PX, newton_ascent_steps
+from sst_graph.batch.by_edges.solution import solution_steps
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.covariance.shared_errors import FEWEST
 from sst_graph.errors import EstimationError
-from sst_graph.graph.outer_loop import JointProblem, solve_joint
+from sst_graph.graph.outer_loop import JointProblem
 from sst_graph.graph.state import State
 from sst_graph.hand_eye.solution import difference
 from sst_graph.objects.tracks import ObjectId
-from sst_graph.stepwise import run_to_end
+from sst_graph.stepwise import Stepwise
 
 FloatArray = NDArray[np.float64]
 
@@ -91,13 +92,13 @@ class LensTest:
         return bool((np.abs(self.step) > MATTERS_SIGMAS * np.sqrt(np.diag(covariance))).any())
 
 
-def examine_lens(
+def lens_steps(
     problem: JointProblem,
     state: State,
     objects: Sequence[Mapping[ObjectId, int]],
     config: AssumptionConfig,
-) -> LensTest:
-    """Estimate the parameters of the lens that are held, and test them.
+) -> Stepwise[LensTest]:
+    """Estimate the parameters of the lens that are held, and test them; step by step.
 
     Args:
         problem: that was solved.
@@ -113,11 +114,11 @@ def examine_lens(
     free = replace(problem, config=replace(problem.config, graph=graph))
     start = replace(state, nuisances={**state.nuisances, **dict.fromkeys(names, 0.0)})
     try:
-        wide = solve_joint(free, start, START_KERNELS_PX)
-        found, _ = run_to_end(newton_ascent_steps(free, wide.state, None))
+        wide = yield from solution_steps(free, start, START_KERNELS_PX)
+        found, _ = yield from newton_ascent_steps(free, wide.state, None)
     except EstimationError:
         return LensTest()
-    _, steps = half_sample_steps(free, found, objects)
+    _, steps = yield from half_sample_steps(free, found, objects)
     findings = [_finding(name, found.nuisances[name], steps[name], config.threshold) for name in names]
     known = sorted((each for each in findings if each is not None), key=lambda each: -each.score)
     return LensTest(tuple(known), difference(state, found))

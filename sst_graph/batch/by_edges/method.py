@@ -10,10 +10,11 @@ import numpy as np
 
 from sst_graph.batch.by_edges.covariance import edges_covariance
 from sst_graph.batch.by_edges.halves import halves_reasons
-from sst_graph.batch.by_edges.lens import examine_lens
+from sst_graph.batch.by_edges.lens import lens_steps
 from sst_graph.batch.by_edges.optimum import RESTARTS, best_optimum_steps, refined_steps, starts_steps
 from sst_graph.batch.by_edges.problem import LabelEstimate, edges_problem, motion_alone
 from sst_graph.batch.by_edges.reasons import EdgeContrast, edge_contrast, edges_reasons, wider_kernel_reasons
+from sst_graph.batch.by_edges.solution import WIDER_KERNEL_PX
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import Guess, MethodEstimate, frames_used
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
@@ -22,10 +23,6 @@ from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.graph.outer_loop import JointSolution, solve_joint
 from sst_graph.hand_eye.solution import MotionSolution, difference
 from sst_graph.stepwise import run_to_end
-
-WIDER_KERNEL_PX = (3.0,)
-"""Scale of the kernel under which an estimate is solved once more [px]: where it moves, it hangs on which of
-several edges nearby are met, and the step is a deviation of its covariance."""
 
 
 def edges_method(
@@ -58,7 +55,7 @@ def edges_method(
     solution = run_to_end(best_optimum_steps(problem, begin, restarts, progress))
     # 4. Covariance, with what halves of the objects disagree by, edges that are farther away, and the lens.
     estimate, assumptions = JointEstimate.of(solution, calibration.objects), calibration.config.assumptions
-    lens = examine_lens(problem.whole, solution.state, calibration.objects, assumptions)
+    lens = run_to_end(lens_steps(problem.whole, solution.state, calibration.objects, assumptions))
     wider = solve_joint(problem.whole, solution.state, WIDER_KERNEL_PX)
     wider_step = difference(solution.state, wider.state)
     own = edges_covariance(problem.whole, estimate, calibration.objects, assumptions, lens.findings)

@@ -10,14 +10,15 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from sst_graph.batch.by_edges.covariance import NEAR_KERNELS_PX
 from sst_graph.batch.by_edges.problem import EdgesProblem
+from sst_graph.batch.by_edges.reasons import SCORE_WORK
+from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX, solution_steps
 from sst_graph.drive.preparation import Progress
 from sst_graph.edges.agreement import score
 from sst_graph.edges.search import edge_starts_steps, turned
 from sst_graph.errors import EstimationError
 from sst_graph.graph.matching import edges_of
-from sst_graph.graph.outer_loop import JointProblem, JointSolution, solve_joint_steps
+from sst_graph.graph.outer_loop import JointProblem, JointSolution
 from sst_graph.graph.state import State
 from sst_graph.hand_eye.solution import difference
 from sst_graph.stepwise import Stepwise
@@ -49,12 +50,8 @@ _GAIN = 1.001
 """A round that raises the score by less than this factor is the last, where only scores are compared."""
 _MAX_ROUNDS = 10
 """Most times that the near scales are gone through."""
-_CONVERGED_STEP = np.array([*np.radians([0.02] * 3), 0.005, 0.005, 0.005, 0.003])
+CONVERGED_STEP = np.array([*np.radians([0.02] * 3), 0.005, 0.005, 0.005, 0.003])
 """(7,) a round that moves by no more is the last [rad, m, s]."""
-_EDGES_WORK = 2
-"""How many times the work of an outer iteration with contours one with edges of pictures is."""
-_SCORE_WORK = 5
-"""A score of some scans, in units of work."""
 
 
 def starts_steps(problem: EdgesProblem) -> Stepwise[list[State]]:
@@ -83,12 +80,12 @@ def refined_steps(
     found, failures = [], []
     for start in starts:
         try:
-            solution = yield from _solution(problem.some, start, START_KERNELS_PX)
+            solution = yield from solution_steps(problem.some, start, START_KERNELS_PX)
         except EstimationError as error:
             failures.append(error)
             continue
         found.append((score(problem.subset_edges, solution.state, SCORE_PX), solution))
-        yield _SCORE_WORK
+        yield SCORE_WORK
     if not found:
         raise failures[0]
     return sorted(found, key=lambda pair: -pair[0])
@@ -102,7 +99,7 @@ def best_optimum_steps(
     Raises:
         EstimationError: too few matches.
     """
-    wide = yield from _solution(problem.whole, start, KERNELS_PX, progress)
+    wide = yield from solution_steps(problem.whole, start, KERNELS_PX, progress)
     best, best_score = yield from newton_ascent_steps(problem.whole, wide.state, progress)
     for _ in range(restarts):
         other = yield from _better_nearby(problem, best)
@@ -113,20 +110,6 @@ def best_optimum_steps(
             break
         best, best_score = again, found_score
     return (yield from _converged(problem.whole, best, progress))
-
-
-def _solution(
-    problem: JointProblem, start: State, kernels_px: Sequence[float], progress: Progress | None = None
-) -> Stepwise[JointSolution]:
-    """As :func:`~sst_graph.graph.outer_loop.solve_joint_steps`, with the work of edges."""
-    steps = solve_joint_steps(problem, start, kernels_px, progress)
-    while True:
-        try:
-            work = next(steps)
-        except StopIteration as stop:
-            solution: JointSolution = stop.value
-            return solution
-        yield _EDGES_WORK * work
 
 
 def _better_nearby(problem: EdgesProblem, state: State) -> Stepwise[State | None]:
@@ -156,10 +139,10 @@ def newton_ascent_steps(
     edges = edges_of(problem.drives, problem.tracks, graph)
     state, found_score = start, 0.0
     for _ in range(_MAX_ROUNDS):
-        solution = yield from _solution(by_peaks, state, NEAR_KERNELS_PX, progress)
+        solution = yield from solution_steps(by_peaks, state, NEAR_KERNELS_PX, progress)
         state = solution.state
         before, found_score = found_score, score(edges, state, SCORE_PX)
-        yield _SCORE_WORK
+        yield SCORE_WORK
         if found_score < _GAIN * before:
             break
     return state, found_score
@@ -173,8 +156,8 @@ def _converged(problem: JointProblem, start: State, progress: Progress | None) -
     """
     state = start
     for _ in range(_MAX_ROUNDS):
-        solution = yield from _solution(problem, state, NEAR_KERNELS_PX, progress)
-        if (np.abs(difference(state, solution.state)) < _CONVERGED_STEP).all():
+        solution = yield from solution_steps(problem, state, NEAR_KERNELS_PX, progress)
+        if (np.abs(difference(state, solution.state)) < CONVERGED_STEP).all():
             break
         state = solution.state
     return solution

@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.drive.preparation import Drive
+from sst_graph.drive.preparation import Drive, ScanFeatures
 from sst_graph.features.lidar_edges import Edge
 from sst_graph.objects.tracks import ObjectId, numbers_in, of_each
+from sst_graph.types import SemanticClass
 
 
 def thinned(drive: Drive, most: int) -> Drive:
     """The drive with at most so many boundary points, evenly spread, of each class in each scan."""
-    scans = []
-    for scan in drive.scans:
-        boundaries = {
-            c: points.take(np.arange(0, len(points), max(1, -(-len(points) // most))))
-            for c, points in scan.boundaries.items()
-        }
-        scans.append(replace(scan, boundaries=boundaries))
-    return replace(drive, scans=tuple(scans))
+    return replace(drive, scans=tuple(thinned_scan(scan, most, scan.boundaries) for scan in drive.scans))
+
+
+def thinned_scan(scan: ScanFeatures, most: int, classes: Collection[SemanticClass]) -> ScanFeatures:
+    """The scan with at most so many boundary points, evenly spread, of each of some classes."""
+    boundaries = {
+        c: points.take(np.arange(0, len(points), max(1, -(-len(points) // most)))) if c in classes else points
+        for c, points in scan.boundaries.items()
+    }
+    return replace(scan, boundaries=boundaries)
 
 
 def with_objects(drive: Drive, tracks: Mapping[ObjectId, int], kept: NDArray[np.bool_]) -> Drive:

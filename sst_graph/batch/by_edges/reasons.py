@@ -15,9 +15,12 @@ from sst_graph.graph.matching import DriveEdges
 from sst_graph.graph.outer_loop import JointSolution
 from sst_graph.graph.state import State
 from sst_graph.hand_eye.solution import MotionSolution, difference
+from sst_graph.stepwise import Stepwise, run_to_end
 
 FloatArray = NDArray[np.float64]
 
+SCORE_WORK = 5
+"""A score of some scans, in units of work (:mod:`sst_graph.stepwise`)."""
 BLUR_PX = 2.0
 """Blur of the scores that are compared [px]."""
 _TURNS = 24
@@ -66,18 +69,41 @@ class EdgeContrast:
 def edge_contrast(
     edges: Sequence[DriveEdges], state: State, others: Sequence[State], seed: int
 ) -> EdgeContrast:
+    """All steps of :func:`edge_contrast_steps`."""
+    return run_to_end(edge_contrast_steps(edges, state, others, seed))
+
+
+def edge_contrast_steps(
+    edges: Sequence[DriveEdges], state: State, others: Sequence[State], seed: int
+) -> Stepwise[EdgeContrast]:
     """Scores at the estimate, at random rotations around it, and at other solutions."""
+    around = []
+    for turned_state in turned_states(state, seed):
+        around.append(score(edges, turned_state, BLUR_PX))
+        yield SCORE_WORK
+    own = score(edges, state, BLUR_PX)
+    apart = [each for each in others if angle_deg(each.cTl, state.cTl) > _APART_DEG]
+    other = max((score(edges, each, BLUR_PX) for each in apart), default=0.0)
+    yield SCORE_WORK * (1 + len(apart))
+    return contrast_of(own, around, other)
+
+
+def turned_states(state: State, seed: int) -> list[State]:
+    """The state turned in random ways; those with one seed are turned alike."""
     rng = np.random.default_rng(seed)
     axes = rng.normal(size=(_TURNS, 3))
     axes /= np.linalg.norm(axes, axis=1)[:, None]
     turns = np.radians(rng.uniform(*_TURN_DEG, _TURNS))[:, None] * axes
-    around = []
-    for R in turned(state.cTl, turns):
-        pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(R), state.cTl.translation())
-        around.append(score(edges, State(pose, state.time_offsets_s, state.biases_px), BLUR_PX))
-    own = score(edges, state, BLUR_PX)
-    apart = [each for each in others if angle_deg(each.cTl, state.cTl) > _APART_DEG]
-    other = max((score(edges, each, BLUR_PX) for each in apart), default=0.0)
+    poses = [gtsam.Pose3(gtsam.Rot3.ClosestTo(R), state.cTl.translation()) for R in turned(state.cTl, turns)]
+    return [State(pose, state.time_offsets_s, state.biases_px) for pose in poses]
+
+
+def contrast_of(own: float, around: Sequence[float], other: float = 0.0) -> EdgeContrast:
+    """How far a score stands out from those of random rotations.
+
+    Args:
+        other: score of the best other optimum; 0 without one.
+    """
     spread = float(np.std(around)) + 1e-9
     return EdgeContrast(own, (own - float(np.mean(around))) / spread, own / max(max(around), 1e-9), other)
 
@@ -104,6 +130,22 @@ def edges_reasons(
     reasons = []
     if not solution.converged:
         reasons.append(f"the outer loop still moved after {solution.outer_iterations} iterations")
+    reasons += contrast_reasons(contrast)
+    if motion is not None:
+        step = difference(motion.state, solution.state)[[0, 1, 2, 6]]
+        total = (motion.covariance + covariance)[np.ix_([0, 1, 2, 6], [0, 1, 2, 6])] + np.diag(_FLOOR**2)
+        chi2 = float(step @ np.linalg.solve(total, step))
+        if chi2 > MAX_MOTION_CHI2:
+            reasons.append(
+                f"motion alone gives another calibration, {np.degrees(np.linalg.norm(step[:3])):.2f} deg and "
+                f"{1e3 * step[3]:+.1f} ms away (chi-squared {chi2:.0f} of 4)"
+            )
+    return (*reasons, *far_reasons(solution.state.cTl, centre.cTl))
+
+
+def contrast_reasons(contrast: EdgeContrast) -> list[str]:
+    """Why a score that stands out so little may be that of a wrong pose."""
+    reasons = []
     if contrast.sigmas < MIN_CONTRAST:
         reasons.append(
             f"edges of LiDAR and pictures agree hardly better than at rotations 2 to 4 deg away "
@@ -116,19 +158,15 @@ def edges_reasons(
             f"(score {contrast.score:.0f} against {contrast.other:.0f}): "
             "give a closer guess or a richer drive"
         )
-    if motion is not None:
-        step = difference(motion.state, solution.state)[[0, 1, 2, 6]]
-        total = (motion.covariance + covariance)[np.ix_([0, 1, 2, 6], [0, 1, 2, 6])] + np.diag(_FLOOR**2)
-        chi2 = float(step @ np.linalg.solve(total, step))
-        if chi2 > MAX_MOTION_CHI2:
-            reasons.append(
-                f"motion alone gives another calibration, {np.degrees(np.linalg.norm(step[:3])):.2f} deg and "
-                f"{1e3 * step[3]:+.1f} ms away (chi-squared {chi2:.0f} of 4)"
-            )
-    away = float(np.linalg.norm(solution.state.cTl.translation() - centre.cTl.translation()))
-    if away > MAX_FROM_GUESS_M:
-        reasons.append(
-            f"the estimate lies {away:.2f} m from the guess, farther than edges can tell (at most "
-            f"{MAX_FROM_GUESS_M:g} m)"
-        )
-    return tuple(reasons)
+    return reasons
+
+
+def far_reasons(cTl: gtsam.Pose3, guess: gtsam.Pose3) -> list[str]:
+    """Why an estimate far from the guess may be wrong."""
+    away = float(np.linalg.norm(cTl.translation() - guess.translation()))
+    if away <= MAX_FROM_GUESS_M:
+        return []
+    return [
+        f"the estimate lies {away:.2f} m from the guess, farther than edges can tell (at most "
+        f"{MAX_FROM_GUESS_M:g} m)"
+    ]

@@ -9,8 +9,10 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from sst_graph.batch.by_edges.choice import with_method_for
+from sst_graph.batch.config import CalibrationConfig
 from sst_graph.cli import EXIT_NOT_TRUSTED
 from sst_graph.cli.inputs import chosen_classes, settings, starting_point
 from sst_graph.cli.labels import check_classes
@@ -153,7 +155,8 @@ def _begun(args: argparse.Namespace, source: Source) -> tuple[Tracker, SweptSour
     Raises:
         DataError: the checkpoint is of another drive, other sensors, settings or another guess.
     """
-    flags = {
+    flags: dict[str, Any] = {
+        "calibration.method": args.method,
         "calibration.classes": chosen_classes(args.classes),
         "calibration.assumptions.estimate": None if args.estimate is None else args.estimate.split(","),
     }
@@ -163,6 +166,7 @@ def _begun(args: argparse.Namespace, source: Source) -> tuple[Tracker, SweptSour
         warn_of_other_pairs(args.init, options_of(args))
     if not (args.resume and args.checkpoint.exists()):
         initial, time_offset_s = starting_point(args.init or "dataset", source, args.camera)
+        config = dataclasses.replace(config, calibration=_with_method(config.calibration, source))
         swept = with_sweep(source, config.calibration.decide_sweep)
         tracker = Tracker(source.camera, config, initial, time_offset_s, swept.sweep_decision)
         return tracker, swept, iter(swept)
@@ -170,12 +174,20 @@ def _begun(args: argparse.Namespace, source: Source) -> tuple[Tracker, SweptSour
     initial, time_offset_s = made.initial, made.initial_time_offset_s
     if args.init is not None:
         initial, time_offset_s = starting_point(args.init, source, args.camera)
-    # What is not asked for is the checkpoint's.
+    # What is not asked for is the checkpoint's; so is the method that was found for the drive.
+    if args.method == "auto":
+        del flags["calibration.method"]
     asked = settings(made.config, args, flags)
     setup = Setup(source.camera, asked, initial, time_offset_s)
     swept = with_sweep(source, made.config.calibration.decide_sweep)
     tracker = Tracker.load(args.checkpoint, setup, swept.sweep_decision)
     return tracker, swept, frames_to_come(tracker, swept, args.checkpoint)
+
+
+def _with_method(config: CalibrationConfig, source: Source) -> CalibrationConfig:
+    """The settings with edges where method auto finds no labels in the drive."""
+    chosen = with_method_for(config, [source])
+    return config if chosen.method == "joint" else chosen
 
 
 def _with_last(frames: Iterator[Frame]) -> Iterator[tuple[Frame, bool]]:

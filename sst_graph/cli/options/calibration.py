@@ -133,6 +133,13 @@ def add_track(commands: Commands) -> argparse.ArgumentParser:
         metavar="dataset|none|FILE",
         help="start: the data's nominal calibration (default), no guess at all, or a file",
     )
+    track.add_argument(
+        "--method",
+        choices=("auto", "joint", "edges", "both"),
+        help="auto: edges where the drive has no labels, else joint (default); joint: outlines of labelled "
+        "objects; edges: LiDAR edges and pictures, no labels needed; both: joint in frames with labels, "
+        "edges in the others",
+    )
     track.add_argument("--classes", metavar="vehicle|all|A,B", help="classes to align")
     add_estimate(track)
     add_settings(track)

@@ -96,11 +96,11 @@ def mean_cost(
     kernel: RobustKernel,
 ) -> float | None:
     """Mean robust cost of boundary points, given each pair's matches and number of boundary points."""
-    worst = float(kernel.loss(GATE * kernel.scale))
     cost, count = 0.0, 0
     for pair, total in pairs:
+        own = next((matches.alignment.kernel for matches in pair.matches.values()), kernel)
         count += total
-        cost += worst * (total - len(pair))
+        cost += float(own.loss(GATE * own.scale)) * (total - len(pair))
         for c, matches in pair.matches.items():
             bias = float(point.biases_px[classes.index(c)])
             cost += alignment_cost(

@@ -175,6 +175,16 @@ class ChangeDetector:
         """
         self._confirm_start(scans, estimate, self.matcher.window.dynamics.recently_moving(), self.config.chi2)
 
+    def confirm_at_end(self, scans: Sequence[int], estimate: ComparedEstimate) -> None:
+        """The frames of the window confirm the estimate where no part of them contradicts it.
+
+        Args:
+            scans: numbers of the scans in the estimate.
+        """
+        moving = self.matcher.window.dynamics.recently_moving()
+        if not self.start_unconfirmed and self._disagreement(scans, estimate, moving) <= self.config.chi2:
+            self.confirmation.begin()
+
     def start_is_over(self, scan: int) -> bool:
         """Whether a contradiction is a change of the calibration from this scan on, not a wrong start."""
         return scan - self._start_scan >= self.warm_up_scans or self.refused_starts >= _MAX_REFUSED_STARTS

@@ -8,8 +8,8 @@ from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.estimate import FrameMatches, OnlineEstimate
 from sst_graph.tracker.monitor.adoption import Adoption
 from sst_graph.tracker.monitor.change_detector import ChangeDetector
+from sst_graph.tracker.start.first_estimate import Guess
 from sst_graph.tracker.start.initializer import Restart
-from sst_graph.tracker.start.solution import Guess
 from sst_graph.tracker.window.matcher import WindowMatcher
 
 
@@ -64,6 +64,10 @@ class Monitor:
         self.changes.recheck_start(scan, list(estimate.smoother.entries), estimate.for_comparison())
 
     def check_start_at_end(self, estimate: OnlineEstimate) -> None:
-        """At the end of a drive: check a start without later frames against its own frames."""
+        """At the end of a drive: check a start without later frames against its own frames; an estimate by
+        edges, which few frames hardly confirm, against all frames of the window."""
         assert estimate.smoother is not None
-        self.changes.check_start_at_end(list(estimate.smoother.entries), estimate.for_comparison())
+        scans, compared = list(estimate.smoother.entries), estimate.for_comparison()
+        self.changes.check_start_at_end(scans, compared)
+        if estimate.edges is not None and not estimate.doubts:
+            self.changes.confirm_at_end(scans, compared)

@@ -4,34 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from sst_graph.batch.lower_edges import LowerEdgeSupport
-from sst_graph.drive.preparation import Drive
-from sst_graph.errors import SstGraphError
-from sst_graph.factors.errors import FactorError
-from sst_graph.stepwise import Stepwise
+from sst_graph.tracker.by_edges.kinds import by_edges
+from sst_graph.tracker.by_edges.review import softness
 from sst_graph.tracker.config import TrackerConfig
-from sst_graph.tracker.start.solution import Guess, first_estimate_steps, prior_gaussian
+from sst_graph.tracker.spread_work import NUMERICAL_ERRORS, Run
+from sst_graph.tracker.start.first_estimate import FirstEstimate, Guess, Stretch
+from sst_graph.tracker.start.solution import prior_gaussian
+from sst_graph.tracker.start.steps import start_steps
 from sst_graph.tracker.uncertainty import Uncertainty
 from sst_graph.tracker.window.epochs import MatchedPair
-from sst_graph.tracker.window.gaussian import Point
 from sst_graph.tracker.window.matcher import WindowMatcher
 from sst_graph.tracker.window.smoother import WindowSmoother
 from sst_graph.tracker.window.window import Window
-
-NUMERICAL_ERRORS = (
-    SstGraphError,
-    FactorError,
-    RuntimeError,
-    ValueError,
-    ArithmeticError,
-    np.linalg.LinAlgError,
-)
-"""Errors that may come from the data; all others are errors of the program."""
 
 _WORK_PER_FRAME = 36
 """Work on a start with each frame, in units of 4 ms: the estimate comes when all is done, some frames
@@ -40,13 +28,23 @@ _RESTART_SCANS = 8
 """Scans that the start after an alarm is made of: fewer than a first one, for it begins near an estimate."""
 _MAX_ATTEMPTS = 2
 """Failed attempts near the last estimate after an alarm; then all of the surroundings are searched."""
+_MORE_FOR_EDGES = 2
+"""So many times the scans for a start where edges are aligned: each shows less than one with labels."""
 _SUPPORT_WORK, _MATCH_WORK = 2, 1
 """To check the lower edges of a scan, and to match one, in units of work."""
 
 
 def searched_scans(config: TrackerConfig) -> int:
     """Latest scans of the window that a start may be made of: half of it, or twice what a start needs."""
-    return max(2 * config.start_scans, 2 * _RESTART_SCANS, config.window // 2)
+    each = max(_needed(config, alarmed) for alarmed in (False, True))
+    return max(2 * each, config.window // 2)
+
+
+def _needed(config: TrackerConfig, alarmed: bool) -> int:
+    """Scans that a start is made of, at least."""
+    needed = _RESTART_SCANS if alarmed else config.start_scans
+    more = _MORE_FOR_EDGES if by_edges(config.calibration.classes) else 1
+    return needed if more == 1 else min(more * needed, config.window)
 
 
 @dataclass(frozen=True)
@@ -70,61 +68,36 @@ class Restart:
 
 @dataclass(frozen=True)
 class Initialization:
-    """A first estimate: the graph of some scans, its uncertainty, and how many scans were matched for it."""
+    """A first estimate: the graph of some scans, its uncertainty, how many scans were matched for it, and
+    where it comes from."""
 
     smoother: WindowSmoother
     uncertainty: Uncertainty
     scans: int
+    first: FirstEstimate
 
-
-class _Run:
-    """A first estimate that is being computed. A failed frame does not roll it back: its result is returned
-    only once the requested work has reached the work done.
-    """
-
-    rolls_back = False
-
-    def __init__(self, steps: Stepwise[Point]) -> None:
-        self._steps = steps
-        self._done = 0
-        self._answer: Point | Exception | None = None
-
-    def until(self, work: int | None) -> Point | None:
-        """The estimate, if it takes no more work than this in all (None: any).
-
-        Raises:
-            EstimationError: it has none; or another of :data:`NUMERICAL_ERRORS`.
-        """
-        while self._answer is None and (work is None or self._done < work):
-            try:
-                self._done += next(self._steps)
-            except StopIteration as stop:
-                self._answer = stop.value
-            except NUMERICAL_ERRORS as error:
-                self._answer = error
-        if self._answer is None or (work is not None and self._done >= work):
-            return None
-        if isinstance(self._answer, Exception):
-            raise self._answer
-        return self._answer
+    @property
+    def softness(self) -> float:
+        """Of its matches (:func:`~sst_graph.tracker.by_edges.review.softness`)."""
+        return softness(self.first.review, self.uncertainty.covariance)
 
 
 class Search:
     """A batch solution of some scans that is being computed.
 
     Attributes:
-        drive: the scans and images that it is made of, as they were when it began.
+        stretch: the scans and images that it is made of, as they were when it began.
         numbers: of the scans.
         guess: where it begins.
         work: work requested so far.
     """
 
-    def __init__(self, drive: Drive, numbers: Sequence[int], guess: Guess, config: TrackerConfig) -> None:
-        self.drive, self.numbers, self.guess, self.config = drive, tuple(numbers), guess, config
+    def __init__(self, stretch: Stretch, numbers: Sequence[int], guess: Guess, config: TrackerConfig) -> None:
+        self.stretch, self.numbers, self.guess, self.config = stretch, tuple(numbers), guess, config
         self.work = 0
-        self._run: _Run | None = None
+        self._run: Run[FirstEstimate] | None = None
 
-    def advance(self, work: int | None) -> Point | None:
+    def advance(self, work: int | None) -> FirstEstimate | None:
         """Do more work (None: all that is left); the estimate, once it is complete.
 
         Raises:
@@ -132,7 +105,7 @@ class Search:
         """
         if self._run is None:
             # A search that was stored is done again as far as it had come: the steps are the same.
-            self._run = _Run(first_estimate_steps(self.drive, self.guess, self.config))
+            self._run = Run(start_steps(self.stretch, self.guess, self.config))
         self.work += work or 0
         return self._run.until(None if work is None else self.work)
 
@@ -147,15 +120,15 @@ class InitialGraph:
     First the lower edges are checked, then each scan is matched.
 
     Attributes:
-        point: the estimate.
+        first: the estimate.
         chosen: numbers of the scans.
         waiting: those whose turn is still to come.
         support: of the lower edges so far; None when it is known.
         found: matches so far, by scan.
     """
 
-    def __init__(self, point: Point, chosen: Sequence[int], config: TrackerConfig) -> None:
-        self.point, self.chosen, self.waiting = point, tuple(chosen), tuple(chosen)
+    def __init__(self, first: FirstEstimate, chosen: Sequence[int], config: TrackerConfig) -> None:
+        self.first, self.chosen, self.waiting = first, tuple(chosen), tuple(chosen)
         self.support = None if config.calibration.lower_edges == "never" else LowerEdgeSupport()
         self.found: dict[int, MatchedPair] = {}
 
@@ -166,9 +139,9 @@ class InitialGraph:
         count = len(self.waiting) if work is None else max(1, work // each)
         some, self.waiting = self.waiting[:count], self.waiting[count:]
         if support is None:
-            self.found |= matcher.match(self.point, some)[0]
+            self.found |= matcher.match(self.first.point, some)[0]
         else:
-            self.support = support.plus(matcher.lower_edge_support(self.point, some))
+            self.support = support.plus(matcher.lower_edge_support(self.first.point, some))
         if self.support is not None and not self.waiting:
             matcher.set_lower_edges(self.support)
             self.support, self.waiting = None, self.chosen
@@ -209,7 +182,7 @@ class Initializer:
     @property
     def needed(self) -> int:
         """Scans that a start is made of, at least."""
-        return _RESTART_SCANS if self.alarmed else self.config.start_scans
+        return _needed(self.config, self.alarmed)
 
     def work(self, matcher: WindowMatcher) -> Initialization | None:
         """Do the work of one scan; the first estimate, once it is complete.
@@ -220,9 +193,9 @@ class Initializer:
         if not self.under_way and self._due(matcher.window):
             self.search = self._search(matcher.window)
         if self.search is not None:
-            point = self.search.advance(self.work_per_frame)
-            if point is not None:
-                self._begin_graph(matcher.window, point, self.search.numbers)
+            first = self.search.advance(self.work_per_frame)
+            if first is not None:
+                self._begin_graph(matcher.window, first, self.search.numbers)
             if self.work_per_frame is not None:
                 return None
         return None if self.graph is None else self._made(matcher, self.work_per_frame)
@@ -238,15 +211,19 @@ class Initializer:
             if self.search is None and (len(window.scans) < self.needed or not window.images):
                 return None
             search = self.search or self._search(window)
+            if by_edges(self.config.calibration.classes):
+                # There are other optima: the whole window tells them apart better.
+                window.dynamics.test_all()
+                search = self._search(window, whole=True)
             try:
-                point = search.advance(None)
+                first = search.advance(None)
             except NUMERICAL_ERRORS:
-                if search.drive.scans[-1] is window.scans[-1][1]:
+                if search.stretch.drive.scans[-1] is window.scans[-1][1]:
                     raise
                 search = self._search(window)
-                point = search.advance(None)
-            assert point is not None
-            self._begin_graph(window, point, search.numbers)
+                first = search.advance(None)
+            assert first is not None
+            self._begin_graph(window, first, search.numbers)
         return self._made(matcher, None)
 
     def _due(self, window: Window) -> bool:
@@ -255,15 +232,14 @@ class Initializer:
         needed = self.needed
         return self.waited >= needed and self.waited % max(1, needed // 2) == 0 and bool(window.images)
 
-    def _search(self, window: Window) -> Search:
-        """Over the latest scans, no more than twice as many as are needed: a step's work grows with them."""
-        drive, numbers = window.drive()
-        scans, numbers = drive.scans[-2 * self.needed :], numbers[-2 * self.needed :]
-        motions = tuple(m for m in drive.lidar_motions if m.from_ns >= scans[0].stamp_ns)
-        drive = replace(drive, scans=scans, lidar_motions=motions)
-        return Search(drive, numbers, self.guess, self.config)
+    def _search(self, window: Window, whole: bool = False) -> Search:
+        """Over the latest scans, no more than twice as many as are needed: a step's work grows with them; or
+        over the whole window, as at the end of a drive."""
+        drive, numbers = window.latest(len(window.scans) if whole else 2 * self.needed)
+        found = window.objects_of(numbers) if window.edges else ({}, {})
+        return Search(Stretch(drive, *found, at_end=whole), numbers, self.guess, self.config)
 
-    def _begin_graph(self, window: Window, point: Point, searched: Sequence[int]) -> None:
+    def _begin_graph(self, window: Window, first: FirstEstimate, searched: Sequence[int]) -> None:
         """Begin with the graph of the scans that an estimate was made of.
 
         Scans that came meanwhile enter later, as new scans do; all are taken at once where no work is spread.
@@ -278,7 +254,7 @@ class Initializer:
         elif len(chosen) < min(self.needed, len(searched)):
             # The search took so long that its scans have left.
             chosen = numbers[-self.needed :]
-        self.search, self.graph = None, InitialGraph(point, chosen, self.config)
+        self.search, self.graph = None, InitialGraph(first, chosen, self.config)
 
     def _made(self, matcher: WindowMatcher, work: int | None) -> Initialization | None:
         """Some work on the graph (None: all that is left); the smoother, once the graph is made."""
@@ -287,14 +263,16 @@ class Initializer:
         while not initial.advance(matcher, work):
             if work is not None:
                 return None
-        graph, point = config.calibration.noise, initial.point
-        prior = prior_gaussian(point, self.guess, matcher.classes, graph)
+        graph = config.calibration.noise
+        prior = prior_gaussian(initial.first, self.guess, matcher.classes, graph)
         found = {scan: one for scan, one in initial.found.items() if scan >= window.first_scan}
         stamps = window.stamps_ns()
         start_ns = min(stamps[scan] for scan in initial.chosen if scan in stamps)
-        smoother = WindowSmoother(prior, start_ns, matcher.classes, graph, config.drift)
+        # Far from where they were made, edges would have no weight.
+        begin = None if initial.first.known is None else initial.first.point
+        smoother = WindowSmoother(prior, start_ns, matcher.classes, graph, config.drift, begin)
         smoother.update(found, set(), window.first_scan, window.objects.live)
-        return Initialization(smoother, Uncertainty.of(smoother), len(initial.chosen))
+        return Initialization(smoother, Uncertainty.of(smoother), len(initial.chosen), initial.first)
 
     def catch_up(self) -> None:
         """Repeat the work that a stored search had done."""

@@ -36,6 +36,7 @@ from sst_graph.initialization.selection import select_start_steps
 from sst_graph.stepwise import Stepwise
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.monitor.adoption import held_out_cost
+from sst_graph.tracker.start.first_estimate import FirstEstimate, Guess
 from sst_graph.tracker.window.gaussian import Gaussian, Point
 from sst_graph.types import SemanticClass
 
@@ -51,25 +52,6 @@ _TRACKS_WORK, _COST_WORK = 12, 3
 _OFFSET_STEP_S = 0.005
 """Damping of the time offset in the first solution, as the prior deviation of a step [s]: a short stretch at
 one speed does not determine it."""
-
-
-@dataclass(frozen=True)
-class Guess:
-    """Where a start begins.
-
-    Attributes:
-        cTl: rough extrinsic, or None where nothing is known.
-        time_offset_s: rough time offset [s].
-        search: search around the guess; False trusts it to within a degree or two.
-    """
-
-    cTl: gtsam.Pose3 | None
-    time_offset_s: float
-    search: bool = True
-
-    def point(self, classes: tuple[SemanticClass, ...], names: Sequence[str] = ()) -> Point:
-        """With mask biases and parameters (``names``) of 0; the identity where nothing is known."""
-        return Point.unbiased(self.cTl or gtsam.Pose3(), self.time_offset_s, classes, names)
 
 
 @dataclass(frozen=True)
@@ -280,14 +262,14 @@ def _check_pairs(
 
 
 def prior_gaussian(
-    point: Point, guess: Guess, classes: tuple[SemanticClass, ...], config: GraphConfig
+    first: FirstEstimate, guess: Guess, classes: tuple[SemanticClass, ...], config: GraphConfig
 ) -> Gaussian:
-    """The batch's own weak priors around the guess, linearized at a point.
+    """The batch's own weak priors around the guess, and what else is known, linearized at a first estimate.
 
     A class's mask bias is around 0, that of its lower edges around the class's; an estimated parameter of an
     assumption is around 0.
     """
-    estimated = dict(named_sigmas(config.estimate))
+    point, estimated = first.point, dict(named_sigmas(config.estimate))
     sigmas = [PRIOR_ROTATION_SIGMA_RAD] * 3 + [PRIOR_TRANSLATION_SIGMA_M] * 3 + [config.time_offset_sigma_s]
     k = len(classes)
     sigmas += [config.mask_bias_sigma_px] * k + [np.inf] * k + [estimated[name] for name in point.names]
@@ -295,4 +277,12 @@ def prior_gaussian(
     tie, biases = LOWER_EDGE_BIAS_SIGMA_PX**-2.0 * np.eye(k), slice(7, 7 + 2 * k)
     information[biases, biases] += np.block([[tie, -tie], [-tie, tie]])
     centre = Point.unbiased(guess.cTl or point.cTl, guess.time_offset_s, classes, point.names)
-    return Gaussian(point, information, information @ point.local(centre))
+    vector = information @ point.local(centre)
+    if first.known is not None:
+        own = np.linalg.inv(first.known.covariance)
+        mean = dataclasses.replace(
+            point, cTl=first.known.state.cTl, time_offset_s=first.known.state.time_offset_s(0)
+        )
+        information[:7, :7] += own
+        vector[:7] += own @ point.local(mean)[:7]
+    return Gaussian(point, information, vector)

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from sst_graph.tracker.tracker import Tracker
 
 FORMAT = "sst-graph/tracker"
-VERSION = 24
+VERSION = 25
 """Goes up whenever what a tracker holds changes: a checkpoint is for the version that wrote it."""
 
 CHECKPOINT = FileKind("a checkpoint of the tracker", 512 * 1024 * 1024)
@@ -264,6 +264,7 @@ def load_checkpoint(
         _check_tracker(_tracker(document, data, path), path)
         tracker = _tracker(document, data, path)
         tracker.initializer.catch_up()
+        tracker.estimate.catch_up()
     if setup is not None:
         check_setup(tracker, setup, path)
     if sweep is not None:

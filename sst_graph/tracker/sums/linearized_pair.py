@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.association.edge_matching import SIDES
+from sst_graph.association.edge_matching import SIDES, MatchConfig
 from sst_graph.covariance.error_model import SideResiduals
 from sst_graph.covariance.match_table import curvatures_of, unweighted
 from sst_graph.covariance.static_objects import dynamic_matches
@@ -20,6 +20,7 @@ from sst_graph.graph.building import UNKNOWN_TWIST_SIGMAS, PairMatches
 from sst_graph.graph.nuisances import columns_of_jacobian
 from sst_graph.graph.state import lower_edge_track
 from sst_graph.objects.tracks import numbers_in, of_each
+from sst_graph.tracker.sums.held import EDGE_ERRORS, edge_error_columns
 from sst_graph.tracker.sums.object_sums import ObjectInformation
 from sst_graph.tracker.window.gaussian import Gaussian, Point
 from sst_graph.types import SemanticClass
@@ -74,12 +75,19 @@ class PairColumns:
     Attributes:
         classes: whose mask biases are estimated, in the order of the point's.
         tracks: number of the track of each (class, object) of the scan.
-        held: assumptions whose parameters are held behind the unknowns.
+        held: what is held behind the unknowns (:func:`~sst_graph.tracker.sums.held.held_names`).
+        config: that the matches were made under.
     """
 
     classes: Sequence[SemanticClass]
     tracks: Mapping[tuple[SemanticClass, int], int]
     held: Sequence[str] = ()
+    config: MatchConfig = field(default_factory=MatchConfig)
+
+    @property
+    def held_assumptions(self) -> list[str]:
+        """Those whose parameters are held."""
+        return [name for name in self.held if name not in EDGE_ERRORS]
 
     def object_places(self, pair: PairMatches) -> dict[int, int]:
         """Place of its class's bias for each object of a pair, if objects have a bias of their own."""
@@ -185,7 +193,7 @@ def _rows(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Weighted rows of all matches by unknowns and held parameters (m, n) and twist (m, 6), residuals and
     root weights (m,)."""
-    classes, held = names.classes, names.held
+    classes, held, assumptions = names.classes, names.held, names.held_assumptions
     blocks, twists, residuals, roots = [], [], [], []
     for c, matches in pair.matches.items():
         alignment, place = matches.alignment, classes.index(c)
@@ -207,8 +215,11 @@ def _rows(
             block[:, place] = pair.terms[c][name] * J[:, 13]
         if held:
             assert pair.scene is not None
-            own = columns_of_jacobian(J, alignment, pair.scene, pair.pair.base_tau_s, at, held)
-            block[:, point.size :] = own
+            n = point.size + len(assumptions)
+            own = columns_of_jacobian(J, alignment, pair.scene, pair.pair.base_tau_s, at, assumptions)
+            block[:, point.size : n] = own
+            if c == SemanticClass.OBJECT:
+                block[:, n:] = edge_error_columns(J, matches, names.config)
         blocks.append(block)
         twists.append(J[:, 7:13])
         residuals.append(r)

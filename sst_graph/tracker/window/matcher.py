@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from sst_graph.association.time_pairing import pair_by_time
-from sst_graph.assumptions import held_at_zero
 from sst_graph.batch.lower_edges import LowerEdgeSupport, lower_edge_support
 from sst_graph.drive.preparation import Drive, boundaries_of, boundary_count
 from sst_graph.drive.trajectory import GrowingTrack
 from sst_graph.factors.robust import RobustKernel
-from sst_graph.graph.building import PairMatches, Tracks, associate
-from sst_graph.graph.matching import DYNAMIC_REACH_M
+from sst_graph.graph.building import GraphConfig, PairMatches, Tracks, associate
+from sst_graph.graph.matching import DYNAMIC_REACH_M, DriveEdges, edges_of
 from sst_graph.graph.outer_loop import KERNELS_PX
+from sst_graph.tracker.by_edges.kinds import EDGE_KERNEL_SHARE, by_edges, by_labels, of_kind
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.monitor.adoption import mean_cost
+from sst_graph.tracker.sums.held import held_names
 from sst_graph.tracker.sums.linearized_pair import LinearizedPair, PairColumns, linearize_pair, with_share
 from sst_graph.tracker.window.epochs import MatchedPair
 from sst_graph.tracker.window.gaussian import Point
@@ -39,7 +40,7 @@ class WindowMatcher:
         self.config = config
         self.classes = config.calibration.classes
         self.graph = config.calibration.noise
-        self.held_names = held_at_zero(self.graph.estimate)
+        self.held_names = held_names(self.graph.estimate, self.classes)
         self.kernel = RobustKernel("geman_mcclure", KERNELS_PX[-1])
         self._twists: tuple[int, Tracks] | None = None
         self._growing = GrowingTrack(_SMOOTHED)
@@ -58,6 +59,8 @@ class WindowMatcher:
         """How well the labels agree with the lower edges of some scans (None: all) at a point."""
         drive, numbers = self.window.drive(None if chosen is None else chosen.__contains__)
         tracks, state = self._tracks(drive, numbers), point.state(self.classes)
+        if by_edges(self.classes):
+            drive = of_kind(drive, edges=False)
         return lower_edge_support([drive], tracks, state, self.config.calibration.joint)
 
     def set_lower_edges(self, support: LowerEdgeSupport) -> None:
@@ -133,7 +136,9 @@ class WindowMatcher:
             number, contours = numbers[pair.scan], part.images[pair.image].contours
             counts: dict[int, int] = {}
             for c, points in boundaries_of(part.scans[pair.scan], self.graph.lower_edges).items():
-                if c in contours:
+                if c in contours and not (
+                    c == SemanticClass.OBJECT and part.have_labels(pair.scan, pair.image)
+                ):
                     cPs = points.lPs @ point.cTl.rotation().matrix().T + point.cTl.translation()
                     inside = points.objects[part.camera.in_image(part.camera.project(cPs))]
                     seen = np.bincount(inside) if len(inside) else np.zeros(0, np.intp)
@@ -180,8 +185,32 @@ class WindowMatcher:
     ) -> tuple[dict[int, PairMatches], list[int]]:
         part, numbers = self.window.drive(None if chosen is None else chosen.__contains__)
         state = point.state(self.classes)
-        pairs = associate([part], self._tracks(part, numbers), state, kernel, self.graph)
+        tracks, pairs = self._tracks(part, numbers), list[PairMatches]()
+        for drive, own_kernel, graph in self._by_kind(part, kernel):
+            pairs += associate([drive], tracks, state, own_kernel, graph)
         return {numbers[pair.pair.scan]: pair for pair in pairs}, numbers
+
+    def _by_kind(
+        self, part: Drive, kernel: RobustKernel
+    ) -> Iterator[tuple[Drive, RobustKernel, GraphConfig]]:
+        """What is matched by labels, and what by edges: the drive with their boundary points, kernel and
+        settings. A pair of scan and image is matched by one of them.
+
+        Edges are matched to the peak of the picture's edge, with the information of a match that follows the
+        pose: matched to the centre of mass, the few steps of a frame would fall short.
+        """
+        if not by_edges(self.classes):
+            yield part, kernel, self.graph
+            return
+        if by_labels(self.classes):
+            yield of_kind(part, edges=False), kernel, self.graph
+        narrow = replace(kernel, scale=EDGE_KERNEL_SHARE * kernel.scale)
+        yield of_kind(part, edges=True), narrow, replace(self.graph, edge_peaks=True)
+
+    def edges_of(self, chosen: Collection[int]) -> list[DriveEdges]:
+        """The boundary points of objects without a class of some scans."""
+        part, numbers = self.window.drive(chosen.__contains__)
+        return edges_of([of_kind(part, edges=True)], self._tracks(part, numbers), self.graph)
 
     def _linearized(
         self,
@@ -192,7 +221,7 @@ class WindowMatcher:
         by_object: bool,
         held: Sequence[str] = (),
     ) -> LinearizedPair:
-        columns = PairColumns(self.classes, self.window.tracks[number], held)
+        columns = PairColumns(self.classes, self.window.tracks[number], held, self.graph)
         return linearize_pair(pair, point, columns, share, by_object)
 
     def _tracks(self, part: Drive, numbers: list[int]) -> Tracks:

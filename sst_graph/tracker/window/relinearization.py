@@ -10,16 +10,24 @@ from collections.abc import Container, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sst_graph.batch.by_edges.optimum import CONVERGED_STEP
+from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX
 from sst_graph.batch.lower_edges import LowerEdgeSupport
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.convergence import step_share
+from sst_graph.tracker.by_edges.kinds import by_edges
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.tracker.window.matcher import WindowMatcher
 from sst_graph.tracker.window.smoother import WindowSmoother
 
+FloatArray = NDArray[np.float64]
+
 _CONVERGED_SIGMAS = 0.02
 """A step of matching and solving that is shorter, in standard deviations, has converged."""
+_EDGE_STEP = CONVERGED_STEP / len(NEAR_KERNELS_PX)
+"""(7,) the same where edges are aligned, a part of what a round of scales may move by [rad, m, s]."""
 _INNER = 2
 """Steps of the optimisation on frozen matches, as in the batch: the next matches change it anyway."""
 SCANS = 5
@@ -90,16 +98,25 @@ def relinearize_window(
         last = i + 1 - len(kernels_px)
         left = smoother.point.core().local(at.core())
         n = len(left)
-        if (
-            last >= 0
-            and left @ np.linalg.solve(smoother.covariance()[0][:n, :n], left) < _CONVERGED_SIGMAS**2
-        ):
+        if last >= 0 and _is_short(left, smoother, matcher):
             return True
         back = np.zeros(smoother.point.size)
         back[:n] = (1.0 - step_share(last)) * left
         at = smoother.point.moved(back)
     smoother.set_point(at)
     return False
+
+
+def _is_short(step: FloatArray, smoother: WindowSmoother, matcher: WindowMatcher) -> bool:
+    """Whether a step of the estimate (m,) is so short that it has converged.
+
+    Edges follow the pose, so that frozen matches are too sure: with them it is the batch's step.
+    """
+    if by_edges(matcher.classes):
+        return bool((np.abs(step[:7]) < _EDGE_STEP).all())
+    n = len(step)
+    P = smoother.covariance()[0][:n, :n]
+    return bool(step @ np.linalg.solve(P, step) < _CONVERGED_SIGMAS**2)
 
 
 class WindowRelinearization:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.association.edge_matching import SIDES
-from sst_graph.assumptions import ASSUMPTIONS, held_at_zero, named_sigmas
+from sst_graph.assumptions import ASSUMPTIONS, named_sigmas
 from sst_graph.covariance.error_model import ErrorModel
 from sst_graph.covariance.jackknife import composed
 from sst_graph.errors import EstimationError
@@ -29,6 +29,7 @@ from sst_graph.graph.state import (
     twist_key,
 )
 from sst_graph.tracker.config import DriftConfig
+from sst_graph.tracker.sums.held import held_names
 from sst_graph.tracker.sums.running_sums import RunningSums
 from sst_graph.tracker.window.epochs import Epoch, EpochSums, MatchedPair, RetiredEpoch
 from sst_graph.tracker.window.gaussian import Gaussian, Point, insert_point
@@ -78,6 +79,7 @@ class WindowSmoother:
         sums: of the covariance, over all that has left the window.
         model: error model of the matches.
         retired: epochs that have left the window, until the history takes them over.
+        begun: the prior's factor in the graph is that of ``past``; it is from the first update on.
     """
 
     def __init__(
@@ -87,10 +89,15 @@ class WindowSmoother:
         classes: Sequence[SemanticClass],
         graph: GraphConfig,
         drift: DriftConfig,
+        begin: Point | None = None,
     ) -> None:
-        """prior: of the first epoch."""
+        """
+        Args:
+            prior: of the first epoch.
+            begin: where the graph is linearized first; None: at the prior's mean.
+        """
         self.classes, self.graph, self.drift = tuple(classes), graph, drift
-        self.held_names = held_at_zero(graph.estimate)
+        self.held_names = held_names(graph.estimate, classes)
         self.prior = self.static = prior
         self.past = self.observed = prior.holding(len(self.held_names))
         self.sums = RunningSums.empty(prior.point.size, len(self.held_names))
@@ -101,9 +108,13 @@ class WindowSmoother:
         self.ids: dict[int, int] = {}
         self.twists: dict[int, TwistFactor] = {}
         values = gtsam.Values()
-        insert_point(values, self.keys(0, prior.point.tracks), prior.mean())
-        self.isam, (self.past_id,) = self._linearized(values)
-        self._point = prior.mean()
+        self.begun = begin is None
+        begin = prior.mean() if begin is None else begin
+        insert_point(values, self.keys(0, prior.point.tracks), begin)
+        # iSAM2 would move to the mean of the prior before it takes the first pairs.
+        held_there = None if self.begun else self._held_at(begin)
+        self.isam, (self.past_id,) = self._linearized(values, held_there)
+        self._point = begin
         self.epoch_sums = EpochSums.empty(prior.point)
 
     @property
@@ -160,6 +171,7 @@ class WindowSmoother:
         self.isam, self.past_id, self._epochs = update.isam, update.past_id, update.epochs
         self.ids, self.twists, self.entries = update.ids, update.twists, update.entries
         self.past, self.observed, self.static = update.past, update.observed, update.static
+        self.begun = True
         self.sums, self.epoch_sums = update.sums, update.epoch_sums
         self._point = update.point
         self.retired += update.retired
@@ -244,6 +256,13 @@ class WindowSmoother:
         isam = gtsam.ISAM2(_parameters(self.graph.estimate))
         whole = self._whole() if graph is None else graph
         return isam, list(isam.update(whole, values).getNewFactorsIndices())
+
+    def _held_at(self, point: Point) -> gtsam.NonlinearFactorGraph:
+        """The prior's information, with its mean at a point."""
+        graph, n = gtsam.NonlinearFactorGraph(), point.size
+        centred = Gaussian(point, self.prior.information, np.zeros(n))
+        graph.add(centred.factor(self.keys(0, point.tracks)))
+        return graph
 
     def _replace_isam(self, isam: gtsam.ISAM2, indices: Sequence[int]) -> None:
         """Go on with an iSAM2 of :meth:`_whole` and its factors' indices."""

@@ -90,7 +90,8 @@ class SmootherUpdate:
         self._tie_twists()
         self._close_epochs()
         self._marginalize_objects()
-        if self.past is not self._smoother.past or self.observed is not self._smoother.observed:
+        before = self._smoother
+        if self.past is not before.past or self.observed is not before.observed or not before.begun:
             self._replace_past()
         # 2. Everything at once.
         result = self.isam.update(self._graph, self._values, self._remove)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import gtsam
 import numpy as np
@@ -16,6 +16,8 @@ from sst_graph.factors.camera import PinholeCamera
 from sst_graph.objects.dynamic_objects import DynamicObject, DynamicObjectTest, dynamic_object_weights
 from sst_graph.objects.occupancy import ObjectName
 from sst_graph.objects.tracks import ObjectId, ObjectTracker
+from sst_graph.odometry.visual import ImagePair
+from sst_graph.tracker.by_edges.kinds import both_kinds, by_edges, by_labels, thinned_edges
 from sst_graph.types import RelativeMotion, SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -33,12 +35,22 @@ class Window:
         growing: no scan leaves; afterwards two leave with each that comes, until ``size`` are left.
         tracks: track of each (class, object) of a scan, by the scan's number.
         dynamics: which objects are dynamic.
+        image_pairs: what consecutive images show of the camera's motion, where that is asked for.
+        labelled_ns: stamps of the scans and of the images that have labels, where edges are aligned, too.
         next_image: number of the next image; images are numbered by ``index`` as they come, never twice.
         origin_ns: stamp of the first image, from which a clock's skew counts; None before there is one.
     """
 
-    def __init__(self, camera: PinholeCamera, scans: int, sampled: int | None = None) -> None:
+    def __init__(
+        self,
+        camera: PinholeCamera,
+        scans: int,
+        sampled: int | None = None,
+        classes: Collection[SemanticClass] = (),
+    ) -> None:
+        """classes: that are aligned."""
         self.camera = camera
+        self.edges, self.labels = by_edges(classes), by_labels(classes)
         self.size = scans
         self.sampled = scans if sampled is None else sampled
         self.objects = ObjectTracker(memory=OBJECT_MEMORY)
@@ -54,6 +66,8 @@ class Window:
         self.scans: deque[tuple[int, ScanFeatures]] = deque()
         self.images: list[ImageFeatures] = []
         self.motions: deque[RelativeMotion] = deque()
+        self.image_pairs: deque[ImagePair] = deque(maxlen=self.size + 10)
+        self.labelled_ns: tuple[set[int], set[int]] = (set(), set())
         self.tracks: dict[int, dict[ObjectName, int]] = {}
         self.dynamics = DynamicObjectTest()
         self.wTl = gtsam.Pose3()
@@ -99,15 +113,20 @@ class Window:
             while len(self.motions) > max(self.size, len(self.scans)) + 10:
                 self.motions.popleft()
             self.wTl = self.wTl.compose(motion.aTb)
+        if self.edges:
+            if self.labels and features.by_geometry is not None:
+                self.labelled_ns[0].add(features.stamp_ns)
+            features = both_kinds(features)
         lean = dataclasses.replace(
             features, depth_lPs=features.depth_lPs[:0], depth_offsets_s=features.depth_offsets_s[:0]
         )
-        self.scans.append((number, lean))
+        self.scans.append((number, thinned_edges(lean) if self.edges else lean))
         self._thin_out()
         self.tracks[number] = self.objects.add(features.boundaries, self.wTl)
         self.dynamics.add(number, lean, self.tracks[number], self.wTl, self.first_scan)
         for old in [k for k in self.tracks if k < self.first_scan]:
             del self.tracks[old]
+        self.labelled_ns[0].intersection_update(scan.stamp_ns for _, scan in self.scans)
         return number
 
     def _thin_out(self) -> None:
@@ -133,6 +152,13 @@ class Window:
         lost = [(c, name, round(10.0 * (1.0 - w))) for (c, name), w in zip(found, weights, strict=True)]
         return frozenset(entry for entry in lost if entry[2] > 0)
 
+    def latest(self, most: int) -> tuple[Drive, list[int]]:
+        """The last scans as a drive, and their numbers."""
+        drive, numbers = self.drive()
+        scans, numbers = drive.scans[-most:], numbers[-most:]
+        motions = tuple(m for m in drive.lidar_motions if m.from_ns >= scans[0].stamp_ns)
+        return dataclasses.replace(drive, scans=scans, lidar_motions=motions), numbers
+
     def objects_of(self, numbers: Sequence[int]) -> tuple[dict[ObjectId, int], dict[ObjectId, DynamicObject]]:
         """Tracks of the objects of some scans, and the dynamic ones, by the scan's position."""
         tracks: dict[ObjectId, int] = {}
@@ -143,8 +169,11 @@ class Window:
             dynamic.update({(position, c, n): one for (c, n), one in found.items()})
         return tracks, dynamic
 
-    def add_image(self, features: ImageFeatures) -> None:
+    def add_image(self, features: ImageFeatures, pair: ImagePair | None = None) -> None:
         """Keep an image, with a number of its own, in the order of stamps.
+
+        Args:
+            pair: what it shows, with the image before it, of the camera's motion.
 
         Raises:
             DataError: one with this stamp is there already.
@@ -157,6 +186,10 @@ class Window:
         self.next_image += 1
         if self.origin_ns is None:
             self.origin_ns = features.stamp_ns
+        if pair is not None:
+            self.image_pairs.append(pair)
+        if self.edges and self.labels and (features.mask != int(SemanticClass.IGNORE)).any():
+            self.labelled_ns[1].add(features.stamp_ns)
 
     def forget_images(self, margin_ns: int, most: int) -> None:
         """Drop images that no scan can meet: those near the window's scans stay, and the newest ones.
@@ -178,6 +211,7 @@ class Window:
         if len(kept) < 2:
             kept = self.images[-2:]
         self.images = kept[-max(2, most) :]
+        self.labelled_ns[1].intersection_update(image.stamp_ns for image in self.images)
 
     def forget_images_before(self, number: int) -> None:
         """Drop all images that came before the one of a number."""
@@ -202,5 +236,14 @@ class Window:
             # As in a drive: the k-th motion leads from the k-th scan to the next.
             motions = tuple(motion for motion in motions if motion.from_ns >= scans[0].stamp_ns)
         images = tuple(self.images)
-        drive = Drive("window", self.camera, tuple(scans), images, motions, (), origin_ns=self.origin_ns)
+        drive = Drive(
+            "window",
+            self.camera,
+            tuple(scans),
+            images,
+            motions,
+            tuple(self.image_pairs),
+            origin_ns=self.origin_ns,
+            labelled_ns=(frozenset(self.labelled_ns[0]), frozenset(self.labelled_ns[1])),
+        )
         return drive, numbers

@@ -12,10 +12,10 @@ from stored import simulated
 from sst_graph import CalibrationConfig
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.batch.assumption_tests import ParameterTest
-from sst_graph.batch.by_edges.covariance import NEAR_KERNELS_PX
-from sst_graph.batch.by_edges.lens import MATTERS_SIGMAS, LensTest, examine_lens
+from sst_graph.batch.by_edges.lens import MATTERS_SIGMAS, LensTest, lens_steps
 from sst_graph.batch.by_edges.optimum import START_KERNELS_PX
 from sst_graph.batch.by_edges.parts import thinned
+from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.batch.method_estimate import Guess
 from sst_graph.batch.problem import CalibrationProblem
@@ -24,6 +24,7 @@ from sst_graph.drive.preparation import Drive
 from sst_graph.graph.outer_loop import solve_joint
 from sst_graph.graph.state import State
 from sst_graph.simulator import SimulationConfig
+from sst_graph.stepwise import run_to_end
 
 STREET = SimulationConfig(
     seed=504,
@@ -51,7 +52,7 @@ def examined(drive: Drive, estimate: Sequence[str] = ()) -> LensTest:
     problem = CalibrationProblem.of([drive], Guess(truth.cTl, truth.time_offset_s), config)
     start, kernels_px = State(truth.cTl, (truth.time_offset_s,)), (*START_KERNELS_PX, *NEAR_KERNELS_PX)
     solution = solve_joint(problem.joint(), start, kernels_px)
-    return examine_lens(problem.joint(), solution.state, problem.objects, config.assumptions)
+    return run_to_end(lens_steps(problem.joint(), solution.state, problem.objects, config.assumptions))
 
 
 def test_the_right_lens_is_not_contradicted(drive: Drive) -> None:
@@ -84,7 +85,8 @@ def test_nothing_is_tested_where_no_test_is_asked_for(drive: Drive) -> None:
     config = CalibrationConfig(method="edges")
     problem = CalibrationProblem.of([drive], Guess(truth.cTl, truth.time_offset_s), config)
     state = State(truth.cTl, (truth.time_offset_s,))
-    assert examine_lens(problem.joint(), state, problem.objects, AssumptionConfig(test=False)) == LensTest()
+    untested = lens_steps(problem.joint(), state, problem.objects, AssumptionConfig(test=False))
+    assert run_to_end(untested) == LensTest()
 
 
 def test_a_lens_matters_where_the_estimate_moves_by_more_than_it_is_known() -> None:

@@ -1,0 +1,69 @@
+"""Where a first estimate begins, what it is made of, and what it is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import gtsam
+
+from sst_graph.batch.by_edges.problem import KnownCalibration
+from sst_graph.drive.preparation import Drive
+from sst_graph.objects.dynamic_objects import DynamicObject
+from sst_graph.objects.tracks import ObjectId
+from sst_graph.tracker.by_edges.review import EdgeReview
+from sst_graph.tracker.window.gaussian import Point
+from sst_graph.types import SemanticClass
+
+
+@dataclass(frozen=True)
+class Guess:
+    """Where a start begins.
+
+    Attributes:
+        cTl: rough extrinsic, or None where nothing is known.
+        time_offset_s: rough time offset [s].
+        search: search around the guess; False trusts it to within a degree or two.
+    """
+
+    cTl: gtsam.Pose3 | None
+    time_offset_s: float
+    search: bool = True
+
+    def point(self, classes: tuple[SemanticClass, ...], names: Sequence[str] = ()) -> Point:
+        """With mask biases and parameters (``names``) of 0; the identity where nothing is known."""
+        return Point.unbiased(self.cTl or gtsam.Pose3(), self.time_offset_s, classes, names)
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Scans that a first estimate is made of.
+
+    Attributes:
+        drive: with their images and motions.
+        tracks: of their objects.
+        dynamic: those that move.
+        at_end: all that there is: the estimate is reviewed after it.
+    """
+
+    drive: Drive
+    tracks: Mapping[ObjectId, int] = field(default_factory=dict)
+    dynamic: Mapping[ObjectId, DynamicObject] = field(default_factory=dict)
+    at_end: bool = False
+
+
+@dataclass(frozen=True)
+class FirstEstimate:
+    """A first estimate.
+
+    Attributes:
+        point: of all unknowns.
+        known: what is known beside the matches; None: the weak priors around the guess alone.
+        review: what a review of edges has found; nothing without edges.
+        reviewed: False where it is still to come.
+    """
+
+    point: Point
+    known: KnownCalibration | None = None
+    review: EdgeReview = field(default_factory=EdgeReview)
+    reviewed: bool = True

@@ -1,0 +1,247 @@
+"""Frames without labels in the tracker: what is kept of them, what edges add to a covariance, and what a
+drive ends at."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stored import simulated
+from streets import TRACKED_STREET
+
+from sst_graph import CalibrationConfig, Tracker, TrackerConfig
+from sst_graph.association.edge_matching import MatchConfig
+from sst_graph.batch.by_edges.problem import POINTS_A_SCAN, KnownCalibration
+from sst_graph.factors.alignment import weighted_residuals
+from sst_graph.features.picture_gradients import PictureGradients
+from sst_graph.graph.state import State
+from sst_graph.tracker import inputs
+from sst_graph.tracker.by_edges.review import EdgeReview, softness
+from sst_graph.tracker.estimate import OnlineEstimate
+from sst_graph.tracker.start.first_estimate import FirstEstimate
+from sst_graph.tracker.start.initializer import InitialGraph
+from sst_graph.tracker.sums.held import EDGE_ERRORS, SHIFTS, edge_error_columns, held_names
+from sst_graph.types import CameraImage, Frame, Scan, SemanticClass
+
+VEHICLE, OBJECT, IGNORE = SemanticClass.VEHICLE, SemanticClass.OBJECT, int(SemanticClass.IGNORE)
+FRAMES = 8
+
+
+def no_mask(image: CameraImage) -> CameraImage:
+    return dataclasses.replace(image, mask=np.full_like(image.mask, IGNORE), instances=None)
+
+
+def no_classes(scan: Scan) -> Scan:
+    return dataclasses.replace(scan, classes=np.full_like(scan.classes, IGNORE), instances=None)
+
+
+def without_labels(frame: Frame) -> Frame:
+    assert frame.scan is not None and frame.image is not None
+    return dataclasses.replace(frame, scan=no_classes(frame.scan), image=no_mask(frame.image))
+
+
+def config(method: str, **further: int) -> TrackerConfig:
+    return TrackerConfig(calibration=CalibrationConfig(method=method), **further)  # type: ignore[arg-type]
+
+
+def begun(method: str, labelled: int, frames: int = FRAMES) -> Tracker:
+    """A tracker that goes on from the truth over some frames, the first of them with labels.
+
+    A start on so few frames is not what is tested: the graph is made at the truth.
+    """
+    street = simulated(TRACKED_STREET)
+    tracker = Tracker(street.camera, config(method), street.truth.cTl, street.truth.time_offset_s or 0.0)
+    tracker.initializer.work = lambda matcher: None  # type: ignore[method-assign]
+    for position in range(frames):
+        frame = street[position]
+        tracker.add(frame if position < labelled else without_labels(frame))
+    del tracker.initializer.work
+    point = tracker.initializer.guess.point(tracker.matcher.classes)
+    known = KnownCalibration(
+        State(point.cTl.retract(np.array([0.3, 0, 0, 0, 0, 0])), (point.time_offset_s,)),
+        np.diag(np.square([1.0, 1.0, 1.0, 0.3, 0.3, 0.3, 1.0])),
+    )
+    first = FirstEstimate(point, known, reviewed=False)
+    numbers = [number for number, _ in tracker.inputs.window.scans]
+    tracker.initializer.graph = InitialGraph(first, numbers, tracker.initializer.config)
+    made = tracker.initializer._made(tracker.matcher, None)
+    assert made is not None
+    tracker.estimate.begin(made)
+    tracker.initializer.succeeded()
+    tracker.monitor.begin(tracker.inputs.window.next_scan)
+    return tracker
+
+
+@cache
+def by_edges() -> Tracker:
+    return begun("edges", 0)
+
+
+def test_classes_by_method() -> None:
+    assert config("edges").estimating.calibration.classes == (OBJECT,)
+    assert config("both").estimating.calibration.classes == (VEHICLE, OBJECT)
+    for method in ("auto", "joint"):
+        assert config(method).estimating.calibration.classes == (VEHICLE,)
+
+
+def test_what_is_kept_of_frames_without_labels() -> None:
+    window = by_edges().inputs.window
+    for _, scan in window.scans:
+        assert set(scan.boundaries) == {OBJECT} and 0 < len(scan.boundaries[OBJECT]) <= POINTS_A_SCAN
+    assert all(isinstance(image.contours[OBJECT], PictureGradients) for image in window.images)
+    assert len(window.image_pairs) == FRAMES - 1
+
+
+def test_labels_are_not_read_by_method_edges() -> None:
+    labelled, bare = begun("edges", FRAMES), by_edges()
+    for (_, one), (_, other) in zip(labelled.inputs.window.scans, bare.inputs.window.scans, strict=True):
+        np.testing.assert_array_equal(one.boundaries[OBJECT].lPs, other.boundaries[OBJECT].lPs)
+    assert set(labelled.inputs.window.images[0].contours) == {OBJECT}
+
+
+def test_images_are_bounded_where_no_scan_comes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(inputs, "_MAX_EDGE_IMAGES", 3)
+    street = simulated(TRACKED_STREET)
+    tracker = Tracker(street.camera, config("edges"), street.truth.cTl)
+    image = without_labels(street[0]).image
+    assert image is not None
+    for k in range(6):
+        late = dataclasses.replace(image, stamp_ns=image.stamp_ns + k * 1_000_000)
+        tracker.add_image(late)
+    assert len(tracker.inputs.window.images) == 3
+
+
+def test_the_graph_is_linearized_where_its_matches_were_made() -> None:
+    """The prior's mean is 17 degrees away: there no edge would have a weight."""
+    tracker = by_edges()
+    assert tracker.estimate.smoother is not None and tracker.estimate.smoother.begun
+    step = tracker.setup.initial.localCoordinates(tracker.estimate.point.cTl)  # type: ignore[union-attr]
+    assert np.degrees(np.linalg.norm(step[:3])) < 1.0 and np.linalg.norm(step[3:]) < 0.2
+
+
+def test_edges_decide_where_they_are_alone() -> None:
+    """The estimate follows a shift that all edges see, but for what the prior holds."""
+    share = by_edges().estimate.uncertainty.edge_share
+    assert share.shape == (7, 7)
+    np.testing.assert_allclose(np.diag(share)[:3], 1.0, atol=0.02)
+
+
+def test_in_a_frame_with_labels_nothing_is_matched_by_edges() -> None:
+    tracker = begun("both", FRAMES)
+    smoother = tracker.estimate.smoother
+    assert smoother is not None and smoother.entries
+    assert all(set(entry.pair.matches) == {VEHICLE} for entry in smoother.entries.values())
+    assert not tracker.estimate.uncertainty.edge_share.any()
+    assert not tracker.estimate.uncertainty.edge_steps.any()
+
+
+def test_both_kinds_in_one_graph() -> None:
+    tracker = begun("both", 4)
+    smoother = tracker.estimate.smoother
+    assert smoother is not None
+    kinds = [next(iter(entry.pair.matches)) for _, entry in sorted(smoother.entries.items())]
+    assert kinds[0] == VEHICLE and kinds[-1] == OBJECT
+    share = np.diag(tracker.estimate.uncertainty.edge_share)[:3]
+    assert (share > 0.02).all() and (share < 0.98).all()
+    kernels = {
+        c: matches.alignment.kernel.scale
+        for entry in smoother.entries.values()
+        for c, matches in entry.pair.matches.items()
+    }
+    assert kernels == pytest.approx({VEHICLE: 3.0, OBJECT: 1.2})
+
+
+def test_what_edges_have_in_common_is_in_the_covariance() -> None:
+    """At least the floor of the batch: 1 cm by axis and 4 ms, as far as edges decide."""
+    estimate: OnlineEstimate = by_edges().estimate
+    more = estimate.reported_covariance() - estimate.covariance[:7, :7] - estimate.considered().covariance(7)
+    share = estimate.uncertainty.edge_share
+    floor = share @ np.diag(np.square([0.0, 0.0, 0.0, 0.01, 0.01, 0.01, 0.004])) @ share.T
+    assert np.linalg.eigvalsh(more - floor).min() > -1e-12
+    assert (np.diag(more) > 0.0).all()
+
+
+def test_errors_of_edges_as_columns() -> None:
+    """A shift as all edges see it is a step of extrinsic and time offset."""
+    smoother = by_edges().estimate.smoother
+    assert smoother is not None
+    assert held_names((), (VEHICLE,)) == held_names((), (VEHICLE, OBJECT))[: -len(EDGE_ERRORS)]
+    entry = next(iter(smoother.entries.values()))
+    matches, at = entry.pair.matches[OBJECT], entry.linear.information.point
+    _, J, _ = weighted_residuals(matches.alignment, at.cTl, at.time_offset_s, entry.pair.motion.c_twist, 0.0)
+    columns = edge_error_columns(J, matches, MatchConfig())
+    np.testing.assert_array_equal(columns[:, -len(SHIFTS) :], J[:, :7])
+    upward = columns[:, EDGE_ERRORS.index("upward")]
+    assert (upward[matches.sides != 2] == 0.0).all()
+
+
+def test_softness() -> None:
+    assert softness(EdgeReview(), np.eye(9)) == 1.0
+    assert softness(EdgeReview(spread=3.0 * np.eye(7)), np.eye(9)) == pytest.approx(4.0)
+
+
+def test_a_doubt_is_a_status() -> None:
+    tracker = begun("edges", 0)
+    edges = tracker.estimate.edges
+    assert edges is not None
+    edges.reasons = ("the pose may be wrong altogether",)
+    assert tracker.estimate.doubts == ("the pose may be wrong altogether",)
+    result = tracker.result()
+    assert result.status == "not_converged" and "the pose may be wrong altogether" in result.reasons[0]
+
+
+def test_a_checkpoint_before_the_start_goes_on_alike(tmp_path: Path) -> None:
+    """Gradients of pictures and what images show of motion are stored, too."""
+    street = simulated(TRACKED_STREET)
+    whole = Tracker(street.camera, config("edges"), street.truth.cTl)
+    for position in range(3):
+        whole.add(without_labels(street[position]))
+    whole.save(tmp_path / "tracker.npz")
+    again = Tracker.load(tmp_path / "tracker.npz", whole.setup)
+    for tracker in (whole, again):
+        tracker.add(without_labels(street[3]))
+    (drive, _), (other, _) = whole.inputs.window.drive(), again.inputs.window.drive()
+    assert len(drive.image_pairs) == len(other.image_pairs) == 3
+    for one, two in zip(drive.image_pairs, other.image_pairs, strict=True):
+        assert one.direction.rotation.equals(two.direction.rotation, 1e-12)
+        np.testing.assert_array_equal(one.tracks.uv_b, two.tracks.uv_b)
+    for image, stored_image in zip(drive.images, other.images, strict=True):
+        gradients, stored_gradients = image.contours[OBJECT], stored_image.contours[OBJECT]
+        assert isinstance(gradients, PictureGradients) and isinstance(stored_gradients, PictureGradients)
+        np.testing.assert_array_equal(gradients.strengths, stored_gradients.strengths)
+
+
+def test_a_checkpoint_with_a_review_under_way(tmp_path: Path) -> None:
+    """What had been done of it is done again: both are at the same step."""
+    tracker = begun("edges", 0)
+    edges, smoother = tracker.estimate.edges, tracker.estimate.smoother
+    assert edges is not None and smoother is not None
+    edges.next = 0
+    edges.advance(tracker.matcher, smoother, None)
+    assert edges.review is not None and edges.review.work > 0
+    tracker.save(tmp_path / "tracker.npz")
+    again = Tracker.load(tmp_path / "tracker.npz").estimate.edges
+    assert again is not None and again.review is not None
+    assert again.review.work == edges.review.work
+    found = [each.review.advance(None) for each in (edges, again)]  # type: ignore[union-attr]
+    np.testing.assert_allclose(found[0].spread, found[1].spread, rtol=1e-6, atol=1e-12)  # type: ignore[union-attr]
+    assert found[0].reasons == found[1].reasons  # type: ignore[union-attr]
+
+
+def test_a_frame_that_cannot_be_used_changes_nothing() -> None:
+    tracker = begun("edges", 0)
+    street = simulated(TRACKED_STREET)
+    frame = without_labels(street[FRAMES])
+    assert frame.image is not None and frame.scan is not None
+    before = tracker.estimate.point
+    wrong = dataclasses.replace(frame.image, pixels=frame.image.pixels[:10])
+    update = tracker.add_image(wrong)
+    assert not update.accepted and update.refused == ("image",)
+    dark = dataclasses.replace(frame.image, pixels=np.zeros_like(frame.image.pixels))
+    assert tracker.add_image(dark).accepted
+    tracker.add_scan(frame.scan)
+    step = before.cTl.localCoordinates(tracker.estimate.point.cTl)
+    assert np.isfinite(step).all() and np.degrees(np.linalg.norm(step[:3])) < 0.5
