@@ -4,29 +4,37 @@ drive ends at."""
 from __future__ import annotations
 
 import dataclasses
+import json
 from functools import cache
 from pathlib import Path
 
+import gtsam
 import numpy as np
 import pytest
 from stored import simulated
 from streets import TRACKED_STREET
 
-from sst_graph import CalibrationConfig, Tracker, TrackerConfig
+from sst_graph import CalibrationConfig, Tracker, TrackerConfig, open_source
 from sst_graph.association.edge_matching import MatchConfig
 from sst_graph.batch.by_edges.problem import POINTS_A_SCAN, KnownCalibration
+from sst_graph.cli import main
 from sst_graph.factors.alignment import weighted_residuals
 from sst_graph.features.picture_gradients import PictureGradients
 from sst_graph.graph.state import State
+from sst_graph.metrics import calibration_errors
+from sst_graph.result import CalibrationResult, read_result
 from sst_graph.tracker import inputs
 from sst_graph.tracker.by_edges.review import EdgeReview, softness
 from sst_graph.tracker.estimate import OnlineEstimate
 from sst_graph.tracker.start.first_estimate import FirstEstimate
 from sst_graph.tracker.start.initializer import InitialGraph
 from sst_graph.tracker.sums.held import EDGE_ERRORS, SHIFTS, edge_error_columns, held_names
-from sst_graph.types import CameraImage, Frame, Scan, SemanticClass
+from sst_graph.tracker.track_update import TrackUpdate
+from sst_graph.types import CameraImage, Frame, Scan, SemanticClass, Source
+from studies.edges_streets import source_of, start_step
 
 VEHICLE, OBJECT, IGNORE = SemanticClass.VEHICLE, SemanticClass.OBJECT, int(SemanticClass.IGNORE)
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 FRAMES = 8
 
 
@@ -245,3 +253,74 @@ def test_a_frame_that_cannot_be_used_changes_nothing() -> None:
     tracker.add_scan(frame.scan)
     step = before.cTl.localCoordinates(tracker.estimate.point.cTl)
     assert np.isfinite(step).all() and np.degrees(np.linalg.norm(step[:3])) < 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.drives
+@pytest.mark.skipif(not DATA.is_dir(), reason="no ../shared")
+@pytest.mark.parametrize(("name", "statuses"), [("stop", {"ok"}), ("parked", {"ok", "unobservable"})])
+def test_a_real_drive_without_label_files(
+    name: str, statuses: set[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Only clouds, pictures, stamps and intrinsics are there; method auto. The last line is the file."""
+    stored = DATA / f"kitti_2011_09_26_{name}" / "sequences" / "00"
+    bare = tmp_path / "sequences" / "00"
+    bare.mkdir(parents=True)
+    for part in ("velodyne", "image_2", "times.txt", "calib.txt"):
+        (bare / part).symlink_to(stored / part)
+    truth = open_source(tmp_path, image_shift=1).truth
+    assert truth is not None and truth.time_offset_s is not None
+    away = np.array([*np.radians([3.0, -4.0, 2.5]), 0.06, -0.08, 0.05])
+    camera = open_source(tmp_path).camera
+    init, out = tmp_path / "init.json", tmp_path / "out.json"
+    init.write_text(CalibrationResult(truth.cTl.retract(away), 0.0, np.eye(7), "ok", camera).to_json())
+    main(["track", str(tmp_path), "--image-shift", "1", "--init", str(init), "--out", str(out)])
+    last = json.loads(capsys.readouterr().out.splitlines()[-1])
+    result = read_result(out)
+    np.testing.assert_array_equal(last["T_camera_lidar"], result.T_camera_lidar.matrix())
+    np.testing.assert_array_equal(last["covariance"], result.covariance)
+    assert last["time_offset_s"] == result.time_offset_s and last["status"] in statuses
+    errors = calibration_errors(result.T_camera_lidar, result.time_offset_s, truth, result.covariance)
+    assert errors.qad_deg < 0.25 and errors.atd_m < 0.03
+    assert errors.time_offset_s is not None and abs(errors.time_offset_s) < 0.015
+    late = result.time_offset_s - truth.time_offset_s
+    step = np.append(truth.cTl.localCoordinates(result.T_camera_lidar), late)
+    assert (np.abs(step) < 3.0 * np.sqrt(np.diag(result.covariance))).all()
+
+
+def tracked(source: Source, initial: gtsam.Pose3) -> tuple[Tracker, TrackUpdate]:
+    """The tracker at the end of a drive, by edges."""
+    tracker = Tracker(source.camera, config("edges"), initial)
+    for frame in source:
+        tracker.add(frame)
+    return tracker, tracker.optimize()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["own-504", "own-507", "third-901"])
+def test_a_street_without_labels(name: str) -> None:
+    street = source_of(name)
+    truth = street.truth
+    assert truth is not None and truth.time_offset_s is not None
+    _, update = tracked(street, truth.cTl.retract(start_step(name)))
+    assert update.status == "ok"
+    step = np.append(
+        truth.cTl.localCoordinates(update.T_camera_lidar), update.time_offset_s - truth.time_offset_s
+    )
+    assert np.degrees(np.linalg.norm(step[:3])) < 0.25 and np.linalg.norm(step[3:6]) < 0.05
+    assert abs(step[6]) < 0.01 and (np.abs(step) < 3.0 * update.sigmas).all()
+
+
+@pytest.mark.slow
+def test_pictures_of_another_street_are_not_trusted() -> None:
+    street, other = source_of("own-504"), source_of("own-508")
+    frames = [
+        dataclasses.replace(frame, image=dataclasses.replace(frame.image, pixels=wrong.image.pixels))
+        for frame, wrong in zip(street, other, strict=True)
+        if frame.image is not None and wrong.image is not None
+    ]
+    assert street.truth is not None
+    tracker = Tracker(street.camera, config("edges"), street.truth.cTl)
+    for frame in frames:
+        assert tracker.add(frame).status != "ok"
+    assert tracker.optimize().status != "ok"
