@@ -218,7 +218,11 @@ def open_source(
     path = Path(path)
     if loader != "auto":
         return find_loader(loader).opened(path, chosen)
-    if not path.exists():
+    try:
+        present = path.exists()
+    except OSError as error:  # such as a name that is too long
+        raise DataError(path, f"no path ({error.strerror})", "a drive") from None
+    if not present:
         raise DataError(path, "no file or folder", "a drive")
     layouts = []
     for name in loader_names():

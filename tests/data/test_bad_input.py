@@ -241,6 +241,11 @@ def test_options_of_another_kind_are_refused(drive: Path, option: str, value: ob
         open_source(drive, **options)
 
 
+def test_a_name_that_no_file_can_have() -> None:
+    with pytest.raises(DataError, match="expected a drive"):
+        open_source("x" * 5000)
+
+
 @pytest.mark.parametrize(
     "frames", ["3", "a:b", "-2:", "3:3", "4:2", "0:6", "5:9", slice(0, 4, 2), slice(-2, None)]
 )
