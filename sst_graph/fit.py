@@ -14,6 +14,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.types import ByValue
+
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
@@ -72,7 +74,7 @@ def _share(value: Any) -> float | None:
 
 
 @dataclass(frozen=True, eq=False)
-class MatchedFrame:
+class MatchedFrame(ByValue):
     """A scan, its image, and the motion between them.
 
     Attributes:
@@ -91,7 +93,7 @@ class MatchedFrame:
 
 
 @dataclass(frozen=True, eq=False)
-class PointResiduals:
+class PointResiduals(ByValue):
     """Boundary points, their contours and their residuals under the calibration.
 
     Attributes:
@@ -149,7 +151,7 @@ class OuterIteration:
 
 
 @dataclass(frozen=True, eq=False)
-class Profile:
+class Profile(ByValue):
     """Profile likelihood along one unknown: the frozen matches' cost, all other unknowns optimised again.
 
     Attributes:
@@ -166,7 +168,7 @@ class Profile:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class Fit(ByValue):
     """How a calibration fits its data.
 
     Attributes:

@@ -30,6 +30,9 @@ from sst_graph.types import ByValue
 FloatArray = NDArray[np.float64]
 Status = Literal["ok", "unobservable", "not_converged"]
 
+CALIBRATION_NAME, RIG_NAME = "calibration.json", "rig.json"
+"""File of one camera, and that of several together, beside a folder for each."""
+
 UNNAMED_CAMERA = "camera"
 """Name of a camera whose name in the data is not known."""
 
@@ -241,13 +244,27 @@ def read_result(path: str | Path) -> CalibrationResult:
     Raises:
         DataError: the file is missing, unreadable or not such a file.
     """
-    file = result_file(Path(path))
+    file = file_of_one_camera(Path(path))
     return CalibrationResult.from_json(read_text(file, CALIBRATION), file)
 
 
 def result_file(path: Path) -> Path:
     """The ``calibration.json`` that a file or the folder that holds one stands for."""
-    return path / "calibration.json" if path.is_dir() else path
+    return path / CALIBRATION_NAME if path.is_dir() else path
+
+
+def file_of_one_camera(path: Path) -> Path:
+    """As :func:`result_file`; of several cameras there is a result each.
+
+    Raises:
+        DataError: the path is that of all of them together.
+    """
+    file = result_file(path)
+    if path.name == RIG_NAME or (not file.exists() and (path / RIG_NAME).is_file()):
+        folder = path if path.is_dir() else path.parent
+        of_one = ", ".join(sorted(str(one.parent) for one in folder.glob(f"*/{CALIBRATION_NAME}")))
+        raise DataError(path, "a rig of several cameras", f"the result of one: {of_one}")
+    return file
 
 
 def _check_status(status: str) -> None:

@@ -19,7 +19,13 @@ from functools import cached_property
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from sst_graph.cameras.model import BoolArray, CameraModel, FloatArray, smallest_positive_root
+from sst_graph.cameras.model import (
+    LARGEST_COEFFICIENT,
+    BoolArray,
+    CameraModel,
+    FloatArray,
+    smallest_positive_root,
+)
 from sst_graph.errors import ConfigError
 
 _NAMES = {0: "pinhole", 4: "plumb_bob", 5: "plumb_bob", 8: "rational_polynomial", 12: "thin_prism"}
@@ -46,7 +52,7 @@ class BrownConradyCamera(CameraModel):
         if len(self.coefficients) not in _NAMES:
             found = f"{len(self.coefficients)} distortion coefficients"
             raise ConfigError(f"camera: found {found}, expected 0, 4, 5, 8 or 12")
-        if not np.isfinite(self.coefficients).all():
+        if not (np.abs(self.coefficients) <= LARGEST_COEFFICIENT).all():
             raise ConfigError(f"camera: found coefficients {self.coefficients}, expected finite numbers")
 
     @property

@@ -16,7 +16,13 @@ from functools import cached_property
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from sst_graph.cameras.model import BoolArray, CameraModel, FloatArray, smallest_positive_root
+from sst_graph.cameras.model import (
+    LARGEST_COEFFICIENT,
+    BoolArray,
+    CameraModel,
+    FloatArray,
+    smallest_positive_root,
+)
 from sst_graph.errors import ConfigError
 from sst_graph.factors.camera import MIN_DEPTH_M
 
@@ -39,7 +45,7 @@ class FisheyeCamera(CameraModel):
     field_of_view_deg: float = 360.0
 
     def __post_init__(self) -> None:
-        if len(self.coefficients) != 4 or not np.isfinite(self.coefficients).all():
+        if len(self.coefficients) != 4 or not (np.abs(self.coefficients) <= LARGEST_COEFFICIENT).all():
             raise ConfigError(f"fisheye camera: found coefficients {self.coefficients}, expected k1 k2 k3 k4")
         if not 0.0 < self.field_of_view_deg <= 360.0:
             raise ConfigError(

@@ -19,6 +19,10 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 
+LARGEST_COEFFICIENT = 1e6
+"""Of a distortion; larger ones are no lens, and their powers overflow."""
+
+
 @dataclass(frozen=True)
 class CameraModel(ABC):
     """A camera with one centre.

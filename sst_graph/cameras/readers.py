@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sst_graph.cameras.brown_conrady import BrownConradyCamera
 from sst_graph.cameras.double_sphere import DoubleSphereCamera
 from sst_graph.cameras.fisheye import FisheyeCamera
-from sst_graph.cameras.model import CameraModel
+from sst_graph.cameras.model import LARGEST_COEFFICIENT, CameraModel
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.files.checked_values import checked_camera, checked_pose, pinhole_camera
@@ -51,8 +51,9 @@ def camera_of(
     """
     intrinsics = checked_camera(intrinsics, place)
     values, name = tuple(float(value) for value in coefficients), distortion.lower()
-    if not np.isfinite(values).all():
-        raise DataError(place, f"distortion coefficients {values}", "finite numbers")
+    if not (np.abs(values) <= LARGEST_COEFFICIENT).all():
+        expected = f"finite numbers of at most {LARGEST_COEFFICIENT:g}"
+        raise DataError(place, f"distortion coefficients {values}", expected)
     if name in _FISHEYE:
         if len(values) != 4:
             raise DataError(place, f"{len(values)} coefficients of {distortion}", "4 (k1 k2 k3 k4)")

@@ -84,12 +84,22 @@ def _sentence(error: OSError) -> str:
     if error.errno is None:
         return str(error)
     what = error.strerror or os.strerror(error.errno)
-    place = error.filename if error.filename is not None else "the operating system"
+    place = error.filename if error.filename is not None else _place_without_name(error)
     if isinstance(place, bytes):
         place = os.fsdecode(place)
     full = error.errno in (errno.ENOSPC, errno.EDQUOT)
     advice = " (free some space, or name another place)" if full else ""
     return f"{place}: {what}{advice}"
+
+
+def _place_without_name(error: OSError) -> str:
+    """What an error without a file's name may be about."""
+    if error.errno == errno.ENOENT:
+        try:
+            os.getcwd()
+        except FileNotFoundError:
+            return "the working directory (was it removed?)"
+    return "the operating system"
 
 
 def _set_up_logging(verbose: bool) -> None:

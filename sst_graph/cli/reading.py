@@ -17,8 +17,9 @@ from sst_graph.cli.labels import LABEL_OPTIONS, labelled
 from sst_graph.cli.messages import complain
 from sst_graph.cli.options import SOURCE_DEFAULTS
 from sst_graph.data import open_source
-from sst_graph.errors import ConfigError, SstGraphError
-from sst_graph.result import CalibrationResult
+from sst_graph.errors import ConfigError, DataError, SstGraphError
+from sst_graph.files.typed_values import matches
+from sst_graph.result import CalibrationResult, result_file
 from sst_graph.types import Source
 
 PAIRING = ("image_shift", "camera", "image_topic", "info_topic", "stamps")
@@ -56,7 +57,7 @@ def open_drive_of(args: argparse.Namespace, path: Path, result: CalibrationResul
     Raises:
         ConfigError: an option contradicts the pairs that the result was made of; or as :func:`open_drive`.
     """
-    stored = {name: value for name, value in result.read_as.items() if name in SOURCE_DEFAULTS}
+    stored = _checked_options(result.read_as, place)
     _check_given(args, stored, place)
     options = dict(SOURCE_DEFAULTS)
     options |= {name: stored[name] for name in (*PAIRING, *MEASUREMENT) if name in stored}
@@ -72,7 +73,7 @@ def open_drive_of(args: argparse.Namespace, path: Path, result: CalibrationResul
 
 def warn_of_other_pairs(choice: str, options: Mapping[str, Any]) -> None:
     """Say so where a start comes from a result of other pairs of scans and images."""
-    stored = _stored_in(Path(choice)).get("image_shift")
+    stored = _stored_in(result_file(Path(choice))).get("image_shift")
     if isinstance(stored, int) and stored != options["image_shift"]:
         complain(
             f"warning: {choice} was made with --image-shift {stored}, found --image-shift "
@@ -150,6 +151,22 @@ def _stored_in(path: Path) -> Mapping[str, Any]:
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return {}  # whatever is wrong with it is said where it is read as a start
     return stored if isinstance(stored, dict) else {}
+
+
+def _checked_options(read_as: Mapping[str, Any], place: Path) -> dict[str, Any]:
+    """The options of a result that are still known; those that are not of their kind are refused.
+
+    Raises:
+        DataError: a number in the place of a text, or the like.
+    """
+    stored = {name: value for name, value in read_as.items() if name in SOURCE_DEFAULTS}
+    for name, value in stored.items():
+        default = SOURCE_DEFAULTS[name]
+        kind: Any = float | int if isinstance(default, float) else str if default is None else type(default)
+        if not (matches(value, kind) or (value is None and default is None)):
+            expected = "a text" if kind is str else "a number"
+            raise DataError(f"{place}: read_as.{name}", f"{value!r:.60}", expected)
+    return stored
 
 
 def _given(args: argparse.Namespace, name: str, default: str | int | float | None) -> Any:

@@ -32,11 +32,11 @@ from sst_graph.errors import ConfigError
 from sst_graph.files import atomic_directory
 from sst_graph.files.strict_json import strict_json
 from sst_graph.inspect.report import Comparison, summary
-from sst_graph.result import CalibrationResult
+from sst_graph.result import RIG_NAME, CalibrationResult
 from sst_graph.rig import KnownPose, KnownRig, RelativePose, RigResult, calibrate_rig, read_rig
 from sst_graph.rig.known import ROTATION_SIGMA_DEG, TRANSLATION_SIGMA_M, poses_by_nominal
 from sst_graph.rig.known_files import read_known_poses
-from sst_graph.rig.result import RIG_NAME, folder_names
+from sst_graph.rig.result import folder_names
 from sst_graph.types import Source
 
 _PRINTED = ("status", "reasons", "covariance", "camera_poses", "known")

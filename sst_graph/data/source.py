@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal, TypedDict, Unpack, get_args
 
 from sst_graph.errors import ConfigError, DataError
+from sst_graph.files.typed_values import wrong_fields
 from sst_graph.sweep_timing import SweepStamp
 from sst_graph.types import Source
 
@@ -21,6 +22,10 @@ TURNS = {"clockwise": -1.0, "azimuth": -1.0, "counterclockwise": 1.0}
 """Share of the sweep in the points, as :class:`~sst_graph.sweep_timing.SweepTiming` counts it."""
 STAMPS: tuple[Stamps, ...] = get_args(Stamps)
 LABEL_ENCODINGS: tuple[LabelEncoding, ...] = get_args(LabelEncoding)
+
+_CHOSEN = ("label_encoding", "sweep", "sweep_stamp", "stamps")
+_EXPECTED = {"frames": "A:B, or a slice", "image_shift": "a whole number", "sweep_start_deg": "a number"}
+"""What an option is, where it is no text."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +71,10 @@ class SourceOptions:
     stamps: Stamps = "header"
 
     def __post_init__(self) -> None:
+        for name in wrong_fields(self):
+            if name not in _CHOSEN:
+                found = f"{name.replace('_', ' ')} {getattr(self, name)!r:.60}"
+                raise ConfigError(f"{found}: expected {_EXPECTED.get(name, 'a text')}")
         if self.label_encoding not in LABEL_ENCODINGS:
             raise ConfigError(f"label encoding {self.label_encoding!r}: expected one of {LABEL_ENCODINGS}")
         if self.sweep not in SWEEPS:
@@ -143,6 +152,8 @@ def find_loader(name: str) -> Loader:
     Raises:
         ConfigError: there is none, or its package cannot be used.
     """
+    if not isinstance(name, str):
+        raise ConfigError(f"loader {name!r:.60}: expected the name of a format")
     if name in _LOADERS:
         return _LOADERS[name]
     entry = _added().get(name)
@@ -207,7 +218,11 @@ def open_source(
     path = Path(path)
     if loader != "auto":
         return find_loader(loader).opened(path, chosen)
-    if not path.exists():
+    try:
+        present = path.exists()
+    except OSError as error:  # such as a name that is too long
+        raise DataError(path, f"no path ({error.strerror})", "a drive") from None
+    if not present:
         raise DataError(path, "no file or folder", "a drive")
     layouts = []
     for name in loader_names():

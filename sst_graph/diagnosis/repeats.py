@@ -75,7 +75,7 @@ def _earlier_points(drive: Drive) -> Finding | None:
 
 def _equal_to_former(digests: Sequence[int]) -> list[int]:
     """Positions of frames that are equal to the one before."""
-    return [k for k in range(1, len(digests)) if digests[k] == digests[k - 1]]
+    return [k for k in range(1, len(digests)) if digests[k] == digests[k - 1] != 0]
 
 
 def _finding(what: str, frame: int, count: int, other: str, check: str) -> Finding:
@@ -90,7 +90,7 @@ def _longest(digests: Sequence[int]) -> tuple[int, int]:
     """Where the longest run of equal digests begins, and its length."""
     best, begin = (0, 1), 0
     for i in range(1, len(digests)):
-        if digests[i] != digests[begin]:
+        if digests[i] != digests[begin] or not digests[i]:
             begin = i
         if i - begin + 1 > best[1]:
             best = (begin, i - begin + 1)

@@ -39,6 +39,12 @@ def clouds(drive: Drive) -> Finding | None:
     middle, upper = float(np.median(heights)), float(np.quantile(heights, 0.75))
     if upper > _LOWEST_VEHICLE_M and middle < _HIGHEST_VEHICLE_M:
         return None
+    if middle <= 0.0:
+        return Finding(
+            "the points labelled vehicle have no height",
+            f"median of {len(heights)} vehicles: {middle:.3g}",
+            "look at the column z of the clouds, then at the class numbers of the labels",
+        )
     scale = middle / _CAR_HEIGHT_M
     evidence = f"vehicles are {middle:.3g} high in the median of {len(heights)}, a car is 1.5 m"
     if ground is not None:

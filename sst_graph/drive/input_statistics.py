@@ -54,7 +54,7 @@ class ScanStatistics:
     Attributes:
         index: of its frame.
         stamp_ns: LiDAR clock [ns].
-        digest: of its points: equal ones are the same scan.
+        digest: of its points: equal ones are the same scan; 0 of a scan without points.
         sweep_s: between its first and last point [s]; 0 where the points carry no times.
         labelled: number of points by class.
         median_range: of all points.
@@ -83,7 +83,7 @@ class ImageStatistics:
         index: of its frame.
         stamp_ns: camera clock [ns].
         picture_digest, mask_digest: equal ones are the same; a picture that is missing or of a single colour
-            shows nothing, and has that of the mask.
+            shows nothing, and has that of the mask; 0 of an image without picture and mask.
         labelled: number of pixels by class.
         rows: mean row of each class's pixels, as a share of the image's height.
         profiles: what the picture shows along the mask's contours, and beside them.
@@ -176,10 +176,11 @@ def image_statistics(index: int, image: CameraImage, closely: bool = True) -> Im
     rows = {c: float(places[c] / count // width) for c, count in labelled.items()}
     shows = image.has_picture and (_varies(image.pixels[::_FEW, ::_FEW]) or _varies(image.pixels))
     mask_digest = zlib.crc32(np.ascontiguousarray(image.mask).tobytes())
+    nothing = not image.has_picture and not image.has_mask
     return ImageStatistics(
         index,
         image.stamp_ns,
-        zlib.crc32(np.ascontiguousarray(image.pixels).tobytes()) if shows else mask_digest,
+        0 if nothing else zlib.crc32(np.ascontiguousarray(image.pixels).tobytes()) if shows else mask_digest,
         mask_digest,
         labelled,
         {c: row / height for c, row in rows.items()},

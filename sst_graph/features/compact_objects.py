@@ -102,7 +102,7 @@ def _linked(points: FloatArray, raised: NDArray[np.bool_], beams: Beams) -> tupl
         pairs.append(_near(columns, a, b, beams.ring[a] == beams.ring[b], limit))
     # Across rings: the raised point of the ring above that is nearest in azimuth.
     keys = beams.keys[some]
-    for up in range(1, _RINGS_UP + 1):
+    for up in range(1, min(_RINGS_UP, len(beams.elevation) - 1) + 1):
         ring = beams.ring[along] + up
         a = along[ring < len(beams.elevation)]
         ring = beams.ring[a] + up

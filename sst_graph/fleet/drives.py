@@ -67,13 +67,16 @@ def find_drives(what: str, name_parts: int = 1) -> list[Drive]:
         ConfigError: none are found, or two have the same name.
         DataError: the list cannot be read.
     """
+    if not what.strip():
+        raise ConfigError("drives: found an empty name, expected a folder of drives, a pattern, or a list")
     place = Place.of(what)
-    if _PATTERN.search(what):
-        drives = [_named(one, name_parts) for one in place.matches()]
-    elif place.is_folder():
+    # A name with brackets may be a folder's own.
+    if place.is_folder():
         drives = [_named(one, name_parts) for one in place.below()]
     elif place.exists():
         drives = _of_list(place, name_parts)
+    elif _PATTERN.search(what):
+        drives = [_named(one, name_parts) for one in place.matches()]
     else:
         raise ConfigError(f"{what}: found nothing, expected a folder of drives, a pattern, or a list")
     if not drives:
@@ -125,18 +128,19 @@ def _by_table(given: str) -> Callable[[Drive], Mapping[str, str | None]]:
 def _by_expression(given: str) -> Callable[[Drive], Mapping[str, str | None]]:
     try:
         expression = re.compile(given)
-    except re.error as error:
-        raise ConfigError(f"--vehicle-from {given!r}: found no regular expression ({error})") from error
+    except (re.error, OverflowError, RecursionError) as error:
+        raise ConfigError(f"--vehicle-from {given!r:.80}: found no regular expression ({error})") from error
     names = expression.groupindex
-    if "vehicle" not in names and not expression.groups:
+    unnamed = [number for number in range(1, expression.groups + 1) if number not in names.values()]
+    if "vehicle" not in names and not unnamed:
         raise ConfigError(f"--vehicle-from {given!r}: found no group, expected (?P<vehicle>...)")
+    group = "vehicle" if "vehicle" in names else unnamed[0]
 
     def told(drive: Drive) -> Mapping[str, str | None]:
         match = expression.search(drive.place.url)
         if match is None:
             return {}
-        named = match.groupdict()
-        return {"vehicle": named.get("vehicle") or match.group(1), "date": named.get("date")}
+        return {"vehicle": match.group(group), "date": match.groupdict().get("date")}
 
     return told
 

@@ -16,6 +16,7 @@ from sst_graph.imports import chains, launch, records, tables, urdf
 from sst_graph.imports.document import TREE, Document, read_document
 from sst_graph.imports.frames import Found, ImportOptions, extrinsic_between, stated_time_offset_s
 from sst_graph.marginal import FORMAT as MARGINAL_FORMAT
+from sst_graph.result import file_of_one_camera
 from sst_graph.types import ByValue
 
 _DEFAULT_CAMERA = "image_2"
@@ -49,7 +50,7 @@ class ImportedCalibration(ByValue):
 def import_calibration(
     path: Path, options: ImportOptions | None = None, form: str | None = None
 ) -> ImportedCalibration:
-    """The calibration in a file of any format of :data:`FORMATS`.
+    """The calibration in a file of any format of :data:`FORMATS`, or in the folder of a result.
 
     Args:
         form: the format; None recognizes it by the contents.
@@ -62,6 +63,8 @@ def import_calibration(
     """
     if form is not None and form not in FORMATS:
         raise ConfigError(f"format {form!r}: expected one of {', '.join(FORMATS)}")
+    if path.is_dir() and (file := file_of_one_camera(path)).exists():
+        path = file
     document = read_document(path)
     form = recognized(document, form)
     return FORMATS[form](document, options or ImportOptions(), form)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sst_graph.errors import DataError, printable
 from sst_graph.result import CalibrationResult, FrameId
+from sst_graph.types import ByValue
 
 FloatArray = NDArray[np.float64]
 
@@ -34,8 +35,8 @@ a row, each off by half a unit of its last digit, and by as much again through t
 _UPPER = np.triu_indices(6)
 
 
-@dataclass(frozen=True)
-class FrameInformation:
+@dataclass(frozen=True, eq=False)
+class FrameInformation(ByValue):
     """What one frame adds. Order of seven: the covariance's; see :mod:`factors`.
 
     Attributes:

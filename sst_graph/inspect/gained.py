@@ -19,6 +19,7 @@ from sst_graph.graph.state import State
 from sst_graph.hand_eye.graph import PRIOR_SIGMAS, HandEyeTerm, state_values
 from sst_graph.inspect.frame_information import MAX_NUMBER
 from sst_graph.result import CalibrationResult, FrameId
+from sst_graph.types import ByValue
 
 FloatArray = NDArray[np.float64]
 
@@ -28,8 +29,8 @@ KEY = "information_gained"
 Kind = Literal["as they came", "beside the others"]
 
 
-@dataclass(frozen=True)
-class Gain:
+@dataclass(frozen=True, eq=False)
+class Gain(ByValue):
     """Information of one frame or one pair of motions. The order of seven is that of the covariance.
 
     Attributes:

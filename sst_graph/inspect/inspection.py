@@ -19,6 +19,7 @@ from sst_graph.inspect.frame_information import KEY, FrameInformation, frames_of
 from sst_graph.inspect.gained import Gained, gained_of
 from sst_graph.inspect.planning import Plan, limits_of, plan_recording
 from sst_graph.result import CalibrationResult, Sigmas, WeakDirection
+from sst_graph.types import ByValue
 
 FloatArray = NDArray[np.float64]
 
@@ -75,8 +76,8 @@ class PixelSigma:
     down_px: float
 
 
-@dataclass(frozen=True)
-class Inspection:
+@dataclass(frozen=True, eq=False)
+class Inspection(ByValue):
     """The uncertainty of a result, analysed.
 
     Attributes:

@@ -28,6 +28,7 @@ from sst_graph.inspect.frame_information import (
     with_offset,
 )
 from sst_graph.result import CalibrationResult
+from sst_graph.types import ByValue
 
 FloatArray = NDArray[np.float64]
 
@@ -47,8 +48,8 @@ MOST_FRAMES = 1000
 """Where the search for a sufficient number of frames ends."""
 
 
-@dataclass(frozen=True)
-class Proposal:
+@dataclass(frozen=True, eq=False)
+class Proposal(ByValue):
     """Frames that could be recorded.
 
     Attributes:
@@ -60,8 +61,8 @@ class Proposal:
     information: FloatArray
 
 
-@dataclass(frozen=True)
-class Prediction:
+@dataclass(frozen=True, eq=False)
+class Prediction(ByValue):
     """What a proposal would give.
 
     Attributes:

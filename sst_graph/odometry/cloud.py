@@ -40,6 +40,10 @@ def _turned(omega: FloatArray, points: FloatArray) -> FloatArray:
     return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=1)
 
 
+FEWEST_POINTS = 11
+"""That small_gicp registers without a warning of its own on stderr."""
+
+
 def usable_points(
     scan: Scan, near_m: float, far_m: float, most: int
 ) -> tuple[FloatArray, NDArray[np.uint8], FloatArray | None]:

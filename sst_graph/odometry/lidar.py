@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 
 from sst_graph.config import Settings, setting
 from sst_graph.errors import DataError
-from sst_graph.odometry.cloud import compensate_sweep, registration_cloud, surfaces, usable_points
+from sst_graph.odometry.cloud import (
+    FEWEST_POINTS,
+    compensate_sweep,
+    registration_cloud,
+    surfaces,
+    usable_points,
+)
 from sst_graph.odometry.local_map import LocalMap, MappedCloud
 from sst_graph.odometry.static_points import StaticPoints
 from sst_graph.types import RelativeMotion, Scan, SemanticClass
@@ -183,6 +189,8 @@ class LidarOdometry:
             start = wTl.copy()
             start[:3, 3] += wTl[:3, :3] @ shift
             result = self._registered(cloud, start, _SEARCH_ITERATIONS)
+            if result is None:
+                return wTl
             found = np.asarray(result.T_target_source)
             missed = cloud.size() - result.num_inliers
             misfit = (2.0 * result.error + _MISSED_COST * missed) / cloud.size()
@@ -195,11 +203,14 @@ class LidarOdometry:
 
     def _registered(
         self, cloud: small_gicp.PointCloud, wTl: FloatArray, iterations: int
-    ) -> small_gicp.RegistrationResult:
-        """A cloud registered to the map from a start."""
+    ) -> small_gicp.RegistrationResult | None:
+        """A cloud registered to the map from a start; None where either has too few points."""
         assert self._map is not None
+        target = self._map.with_all(self._mapped)
+        if min(target.size(), cloud.size()) < FEWEST_POINTS:
+            return None
         return small_gicp.align(
-            self._map.with_all(self._mapped),
+            target,
             cloud,
             wTl,
             max_correspondence_distance=_MAX_DISTANCE_M,
@@ -215,6 +226,8 @@ class LidarOdometry:
             return None
         cloud = registration_cloud(points, self._voxel_m, _NEIGHBOURS, PLANE_RATIO)
         result = self._registered(cloud, wTl, _MAX_ITERATIONS)
+        if result is None:
+            return None
         found = np.asarray(result.T_target_source)
         if not np.isfinite(found).all() or result.num_inliers < _MIN_INLIER_RATIO * cloud.size():
             return None

@@ -16,7 +16,7 @@ import small_gicp
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
-from sst_graph.odometry.cloud import registration_cloud, usable_points
+from sst_graph.odometry.cloud import FEWEST_POINTS, registration_cloud, usable_points
 from sst_graph.odometry.lidar import (
     FAILED_M,
     FAILED_RAD,
@@ -90,6 +90,10 @@ class RegisteredScan:
         """
         if other.stamp_ns <= self.stamp_ns:
             raise DataError("registration of scans", "a second scan not after the first", "rising stamps")
+        covariance = np.diag(np.repeat([FAILED_RAD, FAILED_M], 3) ** 2)
+        failed = RelativeMotion(self.stamp_ns, other.stamp_ns, guess, covariance, ok=False)
+        if min(self.cloud.size(), other.cloud.size()) < FEWEST_POINTS:
+            return failed
         result = small_gicp.align(
             self.cloud,
             other.cloud,
@@ -101,8 +105,7 @@ class RegisteredScan:
         )
         found = np.asarray(result.T_target_source)
         if not np.isfinite(found).all() or result.num_inliers < min_inlier_ratio * other.cloud.size():
-            covariance = np.diag(np.repeat([FAILED_RAD, FAILED_M], 3) ** 2)
-            return RelativeMotion(self.stamp_ns, other.stamp_ns, guess, covariance, ok=False)
+            return failed
         pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(found[:3, :3]), found[:3, 3])
         return RelativeMotion(self.stamp_ns, other.stamp_ns, pose, registration_covariance(result) + _FLOOR)
 

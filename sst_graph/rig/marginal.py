@@ -28,8 +28,8 @@ def rig_keys(number: int) -> tuple[int, int]:
     return int(gtsam.symbol("E", number)), time_offset_key(number)
 
 
-@dataclass(frozen=True)
-class RelativePose:
+@dataclass(frozen=True, eq=False)
+class RelativePose(ByValue):
     """The pose of one camera in another, as estimated.
 
     Attributes:

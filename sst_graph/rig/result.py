@@ -21,7 +21,7 @@ from sst_graph.files.checked_values import check_covariance, check_finite
 from sst_graph.files.json_table import JsonTable, json_table
 from sst_graph.files.reading import FileKind, parse_json, read_text
 from sst_graph.files.strict_json import strict_json
-from sst_graph.result import CalibrationResult, Status, read_result
+from sst_graph.result import CALIBRATION_NAME, RIG_NAME, CalibrationResult, Status, read_result
 from sst_graph.rig.known import KnownPose, KnownRig
 from sst_graph.rig.marginal import RelativePose, RigMarginal
 
@@ -30,7 +30,6 @@ FloatArray = NDArray[np.float64]
 FORMAT = "sst-graph/rig"
 VERSION = 1
 RIG = FileKind("a rig.json", 16 * 1024 * 1024)
-RIG_NAME, CALIBRATION_NAME = "rig.json", "calibration.json"
 
 _MOST_CAMERAS = 64
 _AGREE = 1e-9

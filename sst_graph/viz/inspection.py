@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.errors import MissingDependencyError
 from sst_graph.inspect.inspection import HUMAN, NAMES, UNITS, Inspection
 from sst_graph.inspect.planning import AT_REST_MPS, Plan
 from sst_graph.viz.graph_plot import draw_graph
+from sst_graph.viz.matplotlib_figure import figure_class
 
 FloatArray = NDArray[np.float64]
 
@@ -32,14 +32,9 @@ def inspection_plots(inspection: Inspection) -> dict[str, Any]:
     several frames, what to record next where it has one.
 
     Raises:
-        MissingDependencyError: matplotlib is not installed.
+        MissingDependencyError, ConfigError: matplotlib is not installed, or does not start.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingDependencyError(
-            "plots need matplotlib, which is not installed: pip install 'sst-graph[plot]'"
-        ) from error
+    Figure = figure_class()
 
     def figure(width: float, height: float) -> Any:
         return Figure(figsize=(width, height), layout="constrained")

@@ -95,6 +95,7 @@ def test_distortion_models_of_ros(changes: dict[str, Any], expected: object) -> 
         ({"d": (0.1,) * 7}, "found 7 coefficients of plumb_bob, expected 4 or 5"),
         ({"d": (0.1,) * 14, "distortion_model": "rational_polynomial"}, "tilted sensor"),
         ({"d": (np.nan,) * 5}, "NaN or inf"),
+        ({"d": (1e300,) * 5}, "finite numbers of at most 1e\\+06"),
         ({"k": np.eye(3).ravel()}, "fx = 1 px"),
         ({"width": 0}, "whole numbers of pixels"),
         ({"k": K.ravel()[:8]}, "K: found 8 numbers, expected 9"),

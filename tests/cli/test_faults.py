@@ -231,3 +231,11 @@ def test_what_nobody_foresaw_is_one_line() -> None:
     line = done.stderr.removesuffix("\n")
     assert line.isprintable() and line.startswith("sst-graph: error: unexpected KeyError: ")
     assert "at <string>:6 (a defect, please report it with what --verbose says)" in line
+
+
+def test_the_working_directory_was_removed(tmp_path: Path) -> None:
+    program = "import os, sys; os.rmdir(os.getcwd()); from sst_graph.cli import main; sys.exit(main())"
+    (tmp_path / "gone").mkdir()
+    command = [sys.executable, "-c", program, "simulate", "out", "--frames", "1"]
+    done = subprocess.run(command, cwd=tmp_path / "gone", capture_output=True, text=True)
+    assert done.returncode == 2 and "the working directory (was it removed?)" in done.stderr

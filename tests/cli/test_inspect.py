@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -162,6 +164,18 @@ def test_without_matplotlib(
     captured = capsys.readouterr()
     assert "pip install 'sst-graph[plot]'" in captured.err and captured.err.count("\n") == 1
     assert captured.out == "" and not (tmp_path / "plots").exists()
+
+
+def test_where_matplotlib_does_not_start(tmp_path: Path, result: CalibrationResult) -> None:
+    """matplotlib refuses an MPLBACKEND that it does not know when it is imported."""
+    program = "import sys; from sst_graph.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", program, "inspect", written(tmp_path, result)]
+    environment = {**os.environ, "MPLBACKEND": "nonsense"}
+    done = subprocess.run(
+        [*command, "--plots", str(tmp_path / "plots")], capture_output=True, text=True, env=environment
+    )
+    assert done.returncode == 2 and "matplotlib does not start" in done.stderr
+    assert done.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize(

@@ -93,10 +93,39 @@ def test_other_pairs_are_refused_and_other_measurements_reported(
     assert "was made with --sweep auto, found --sweep instant" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("frames", 0, "a text"),
+        ("cloud", [[]], "a text"),
+        ("sequence", -1, "a text"),
+        ("loader", {}, "a text"),
+        ("camera", None, "a text"),
+        ("image_shift", "1", "a number"),
+        ("sweep_start_deg", True, "a number"),
+    ],
+)
+def test_options_of_another_kind_in_a_result_are_refused(
+    street: Path,
+    shifted: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    name: str,
+    value: object,
+    expected: str,
+) -> None:
+    document = json.loads((shifted / "calibration.json").read_text())
+    document["read_as"][name] = value
+    changed = tmp_path / "changed.json"
+    changed.write_text(json.dumps(document))
+    error = _refused(capsys, "overlay", changed, street, "--out", tmp_path / "a.png")
+    assert f"{changed}: read_as.{name}: found {value!r}, expected {expected}" in error
+
+
 def test_a_start_of_other_pairs_is_reported(
     street: Path, shifted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    start = str(shifted / "calibration.json")
+    start = str(shifted)
     command = ["track", str(street), "--init", start, "--set", "calibration.search.enabled=false"]
     assert main(command) == 3
     assert "was made with --image-shift 1, found --image-shift 0" in capsys.readouterr().err

@@ -223,6 +223,30 @@ def test_bad_ground_truth_is_refused(drive: Path, content: str, message: str) ->
 
 
 @pytest.mark.parametrize(
+    ("option", "value", "expected"),
+    [
+        ("frames", 5, "expected A:B, or a slice"),
+        ("camera", 2, "expected a text"),
+        ("cloud", None, "expected a text"),
+        ("sequence", 0, "expected a text"),
+        ("image_shift", 1.5, "expected a whole number"),
+        ("sweep_start_deg", "0", "expected a number"),
+        ("sweep", ["auto"], "expected one of"),
+        ("loader", ["kitti"], "expected the name of a format"),
+    ],
+)
+def test_options_of_another_kind_are_refused(drive: Path, option: str, value: object, expected: str) -> None:
+    options: dict[str, Any] = {option: value}
+    with pytest.raises(ConfigError, match=expected):
+        open_source(drive, **options)
+
+
+def test_a_name_that_no_file_can_have() -> None:
+    with pytest.raises(DataError, match="expected a drive"):
+        open_source("x" * 5000)
+
+
+@pytest.mark.parametrize(
     "frames", ["3", "a:b", "-2:", "3:3", "4:2", "0:6", "5:9", slice(0, 4, 2), slice(-2, None)]
 )
 def test_bad_ranges_are_refused(drive: Path, frames: str | slice) -> None:

@@ -54,6 +54,15 @@ def test_a_folder_brings_the_frames_of_kitti_odometry(kitti_drive: Path, tmp_pat
     assert_same_drive(source, open_source(kitti_drive))
 
 
+def test_files_that_macos_leaves_are_no_frames(kitti_drive: Path, tmp_path: Path) -> None:
+    folder = as_folder(kitti_drive, tmp_path / "folder")
+    count = len(open_source(folder))
+    for name in ("images", "clouds", "masks", "labels"):
+        for path in list((folder / name).iterdir()):
+            path.with_name(f"._{path.name}").write_bytes(b"\0\5\x16\7")
+    assert len(open_source(folder)) == count
+
+
 @pytest.mark.slow
 def test_a_folder_of_a_lens_that_distorts_is_rectified(tmp_path: Path) -> None:
     folder = as_folder(written(CROWDED_STREET) / "sequences" / "00", tmp_path / "street")

@@ -28,7 +28,7 @@ from sst_graph.features.mask_shift import contour_profiles, mask_shift
 from sst_graph.odometry.sweep import SweepDecision
 from sst_graph.simulator import SimulationConfig
 from sst_graph.sweep_timing import SweepTiming
-from sst_graph.types import SemanticClass
+from sst_graph.types import NO_PICTURE, Scan, SemanticClass
 from studies.subtle_faults import SUBTLE_FAULTS, SUBTLE_NAMED, repeated_pictures
 from studies.wrong_drives import INPUT_FAULTS, NAMED, shifted_masks
 
@@ -106,6 +106,14 @@ def test_frames_that_hold_earlier_ones_are_named(fault: str) -> None:
 
 def test_a_doubled_picture_now_and_then_is_left_to_the_robust_matching() -> None:
     assert causes(repeated_pictures(drive(), every=5)) == []
+
+
+def test_frames_without_content_are_no_repeated_ones() -> None:
+    """Missing pictures are all alike, and so are scans without points; no sensor is frozen."""
+    none = np.uint8(SemanticClass.IGNORE)
+    blind = drive().with_images(lambda i: replace(i, pixels=NO_PICTURE, mask=np.full_like(i.mask, none)))
+    empty = drive().with_scans(lambda s: Scan(s.stamp_ns, s.points[:0], s.classes[:0]))
+    assert not any("repeated" in sentence for sentence in (*causes(blind), *causes(empty)))
 
 
 @cache

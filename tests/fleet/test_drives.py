@@ -46,6 +46,10 @@ def test_vehicle_and_date_by_an_expression(tree: Path) -> None:
     assert [drive.vehicle for drive in found] == ["v1", "v1", "v2", "v2"]
     assert found[1].day - found[0].day == 7.0  # type: ignore[operator]
     assert with_vehicles(drives, r"/(v\d)/")[3].vehicle == "v2"
+    # A group that takes no part in the match says nothing; the date is no vehicle.
+    found = with_vehicles(drives, r"(?P<date>\d{8})$|(?P<vehicle>v2)")
+    assert [drive.vehicle for drive in found] == ["", "", "v2", "v2"]
+    assert with_vehicles(drives, r"(v\d)/(?P<date>\d{8})$")[0].vehicle == "v1"
 
 
 def test_vehicle_and_date_by_a_table(tree: Path, tmp_path: Path) -> None:
@@ -92,11 +96,30 @@ def test_a_list_that_is_no_text(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "words"), [("(", "no regular expression"), ("v1", "no group"), ("(nothing)", "no vehicle")]
+    ("given", "words"),
+    [
+        ("(", "no regular expression"),
+        ("(" * 5000, "no regular expression"),
+        ("a{99999999999}", "no regular expression"),
+        ("v1", "no group"),
+        (r"(?P<date>\d{8})", "no group"),
+        ("(nothing)", "no vehicle"),
+    ],
 )
 def test_an_expression_that_is_none(tree: Path, given: str, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         with_vehicles(find_drives(str(tree / "v1")), given)
+
+
+def test_a_folder_whose_name_looks_like_a_pattern(tmp_path: Path) -> None:
+    (tmp_path / "runs [1]" / "a").mkdir(parents=True)
+    assert [drive.name for drive in find_drives(str(tmp_path / "runs [1]"))] == ["a"]
+
+
+@pytest.mark.parametrize("what", ["", " "])
+def test_an_empty_name_is_not_the_root(what: str) -> None:
+    with pytest.raises(ConfigError, match="an empty name"):
+        find_drives(what)
 
 
 @pytest.mark.parametrize("what", ["nowhere", "nowhere/*"])

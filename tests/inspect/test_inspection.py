@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from dataclasses import replace
 
@@ -124,6 +125,14 @@ def test_frames_that_matter_and_frames_that_do_not() -> None:
     assert telling_frames(FRAMES, 0) == [0, 1] and telling_frames(FRAMES, 3) == [2, 1]
     assert redundant_frames(FRAMES, 0.01) == (1,)
     assert redundant_frames(FRAMES, 0.25) == (0, 1)
+
+
+def test_inspections_are_compared_by_value() -> None:
+    covariance = np.diag(np.arange(1.0, 8.0) ** 2 * 1e-6)
+    one = inspect_result(result_of(covariance, FRAMES))
+    again = copy.deepcopy(one)
+    assert again == one and hash(again) == hash(one)
+    assert inspect_result(result_of(2.0 * covariance, FRAMES)) != one
 
 
 def test_lists_of_frames() -> None:

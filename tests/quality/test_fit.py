@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from functools import cache
 
@@ -118,6 +119,7 @@ def test_a_profile_is_below_every_cost_with_the_others_held() -> None:
 
 def test_the_sample_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = _fit()
+    assert copy.deepcopy(whole) == whole and hash(whole) == hash(_fit())
     monkeypatch.setattr(fit_of_solution, "MOST_POINTS", 100)
     _, solution = _solved()
     small = _of_drives().fit(solution, np.full(7, 1e-3), None, ())

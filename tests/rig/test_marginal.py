@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import gtsam
 import numpy as np
 import pytest
@@ -25,6 +27,12 @@ def test_the_factor_is_the_quadratic_of_the_covariance() -> None:
         moved.insert(D, np.array([marginal.time_offsets_s[k] + step[6]]))
     expected = 0.5 * float(d @ np.linalg.solve(marginal.covariance, d))
     assert factor.error(moved) == pytest.approx(expected, rel=1e-6)
+
+
+def test_poses_between_cameras_are_compared_by_value() -> None:
+    one, again = (marginal_of(3).relative_poses() for _ in range(2))
+    assert one == again and hash(one[0]) == hash(again[0]) and one[0] != one[1]
+    assert pickle.loads(pickle.dumps(one[0])) == one[0]
 
 
 def test_marginals_of_the_factor_are_the_covariance() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from rigs import marginal_of, result_of
 
+from sst_graph.cli import main
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.rig import KnownPose, KnownRig, RigResult, read_rig
 from sst_graph.rig.result import folder_names
@@ -90,3 +91,18 @@ def test_a_calibration_that_is_missing(rig: RigResult, tmp_path: Path) -> None:
 def test_a_camera_that_is_not_there(rig: RigResult) -> None:
     with pytest.raises(ConfigError, match="cam0, cam1, cam2"):
         rig["cam9"]
+
+
+@pytest.mark.parametrize("name", ["", "rig.json"])
+def test_a_command_for_one_camera_names_the_folders_of_each(
+    rig: RigResult, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    folder = _written(rig, tmp_path / "rig")
+    for command in (["inspect"], ["evaluate", "--truth", str(folder / "cam0")]):
+        assert main([*command, str(folder / name)]) == 2
+        error = capsys.readouterr().err
+        assert f"found a rig of several cameras, expected the result of one: {folder / 'cam0'}" in error
+        assert error.count("\n") == 1
+    assert main(["import", str(folder / name)]) == 2
+    assert "found a rig of several cameras" in capsys.readouterr().err
+    assert main(["import", str(folder / "cam0")]) == 0

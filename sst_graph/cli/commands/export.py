@@ -13,9 +13,8 @@ from sst_graph.export import ExportOptions, export_text
 from sst_graph.export.text import heading
 from sst_graph.files import output_file
 from sst_graph.imports import read_tree
-from sst_graph.result import CalibrationResult, read_result, result_file
+from sst_graph.result import RIG_NAME, CalibrationResult, read_result, result_file
 from sst_graph.rig import RigResult, read_rig
-from sst_graph.rig.result import RIG_NAME
 
 
 def run(args: argparse.Namespace) -> int:

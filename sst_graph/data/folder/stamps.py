@@ -55,7 +55,9 @@ def stamped_files(folder: Path, suffixes: tuple[str, ...]) -> StampedFiles:
             file that names no file or no stamp.
     """
     entries = listed(folder, f"files {', '.join('*' + suffix for suffix in suffixes)}")
-    files = {path.name: path for path in entries if path.suffix.lower() in suffixes}
+    # Hidden files are no data: macOS puts "._NAME" beside NAME on foreign disks.
+    shown = (path for path in entries if not path.name.startswith("."))
+    files = {path.name: path for path in shown if path.suffix.lower() in suffixes}
     if not files:
         raise DataError(folder, "no such file", f"files {', '.join('*' + suffix for suffix in suffixes)}")
     table = folder.with_name(f"{folder.name}.csv")

@@ -57,7 +57,12 @@ def cloud_of(message: Any, stamp_ns: int, place: str, times: bool = True, labels
     Raises:
         DataError: no x, y, z; fewer bytes than points; times that are no times of this scan.
     """
-    table = _table(message, place)
+    # What has no value as a float of 32 bits becomes inf, and is left out.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _cloud(_table(message, place), stamp_ns, place, times, labels)
+
+
+def _cloud(table: NDArray[Any], stamp_ns: int, place: str, times: bool, labels: bool) -> Cloud:
     points = np.stack([_floats(table, axis) for axis in "xyz"], axis=1).astype(np.float32)
     # Drivers give NaN or the origin for beams without a return.
     used = np.isfinite(points).all(axis=1) & (points != 0.0).any(axis=1)

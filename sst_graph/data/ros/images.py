@@ -80,9 +80,11 @@ def _rows(message: Any, place: str) -> NDArray[np.uint8]:
     if encoding not in _CHANNELS:
         hint = ", convert it to 8 bits" if "16" in encoding or "32" in encoding else ""
         raise DataError(place, f"encoding {encoding!r}", f"one of {', '.join(_CHANNELS)}{hint}")
-    if not 0 < height * width <= MAX_PIXELS:
+    if min(height, width) < 1 or height * width > MAX_PIXELS:
         raise DataError(place, f"{width}x{height} px", f"1 to {MAX_PIXELS} pixels")
-    channels, step = _CHANNELS[encoding], int(message.step) or width * _CHANNELS[encoding]
+    channels = _CHANNELS[encoding]
+    # Of a single row nothing follows, whatever its step says.
+    step = (height > 1 and int(message.step)) or width * channels
     data = np.asarray(message.data, np.uint8)
     if step < width * channels or len(data) < step * (height - 1) + width * channels:
         found = f"{len(data)} bytes in rows of {step}"

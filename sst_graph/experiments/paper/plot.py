@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from sst_graph.errors import MissingDependencyError
 from sst_graph.experiments.paper.config import START, PaperTableConfig
 from sst_graph.experiments.paper.runs import Run
 from sst_graph.experiments.paper.summary import Layout
+from sst_graph.viz.matplotlib_figure import figure_class
 
 _LEAST = 1e-3
 """Smaller values are drawn here, for the axes are logarithmic."""
@@ -22,26 +22,19 @@ def check_plot() -> None:
     """Refuse early where a plot cannot be drawn.
 
     Raises:
-        MissingDependencyError: matplotlib is not installed.
+        MissingDependencyError, ConfigError: matplotlib is not installed, or does not start.
     """
-    try:
-        import matplotlib.figure  # noqa: F401
-    except ImportError as error:
-        raise MissingDependencyError(
-            "the plot needs matplotlib, which is not installed: pip install 'sst-graph[plot]', "
-            "or --set plot=false"
-        ) from error
+    figure_class(", or --set plot=false")
 
 
 def plot_svg(runs: Sequence[Run], layout: Layout, config: PaperTableConfig) -> str:
     """The plot as SVG: rotation, translation and, where the table has it, the time offset.
 
     Raises:
-        MissingDependencyError: matplotlib is not installed.
+        MissingDependencyError, ConfigError: as :func:`check_plot`.
     """
-    check_plot()
+    Figure = figure_class()
     import matplotlib as mpl
-    from matplotlib.figure import Figure
 
     panels: list[tuple[str, Callable[[Run], float | None]]] = [
         ("QAD [deg]", lambda run: run.qad_deg),

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from sst_graph.drive.preparation import Progress
-from sst_graph.errors import MissingDependencyError
 from sst_graph.experiments.peers.methods import OWN, PEERS
 from sst_graph.experiments.peers.runs import START, PeerRun, PeersConfig, runs_of_task, tasks_of
 from sst_graph.experiments.resumable import Work, rows_of
 from sst_graph.files import atomic_write_bytes
+from sst_graph.viz.matplotlib_figure import figure_class
 
 _COLOURS = (
     "#d1342f",
@@ -39,7 +39,7 @@ def run(config: PeersConfig, progress: Progress | None = None) -> str:
         DataError: a drive cannot be used.
         MissingDependencyError: a figure is asked for, and matplotlib is not installed.
     """
-    figure_of = _figure_class() if config.figure else None
+    figure_of = figure_class() if config.figure else None
     found = rows_of(Work(runs_of_task, PeerRun, config.jobs, config.records), tasks_of(config), progress)
     runs = [row for rows in found for row in rows]
     if figure_of is not None:
@@ -100,16 +100,6 @@ def _remaining_cells(method: str, runs: Sequence[PeerRun], config: PeersConfig) 
 def _median(values: Sequence[float | None], digits: int, unit: str = "") -> str:
     known = [value for value in values if value is not None]
     return f"{np.median(known):.{digits}f}{unit}" if known else "–"
-
-
-def _figure_class() -> Callable[..., Any]:
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingDependencyError(
-            "the figure needs matplotlib, which is not installed: pip install 'sst-graph[plot]'"
-        ) from error
-    return Figure
 
 
 def figure(runs: Sequence[PeerRun], config: PeersConfig, figure_of: Callable[..., Any]) -> bytes:

@@ -178,7 +178,7 @@ def decide_sweep(
     timing = SweepTiming(0.0, -np.pi, period_s, stamp)
     if max(pair.speed_ratio for pair in pairs) < 1.0:
         return SweepDecision("standstill", timing, speed_mps=max(pair.speed_mps for pair in pairs))
-    both = tuple(replace(timing, fraction=f) for f in (-1.0, 1.0))
+    both = tuple(replace(timing, fraction=f) for f in FRACTIONS.values() if f)
     decision = SweepDecision("undecided", timing, others=both)
     windows: list[Window] = []
     used: list[int] = []
@@ -241,6 +241,9 @@ def _decide(windows: Sequence[Window], timing: SweepTiming) -> SweepDecision:
     if speed * timing.period_s > _LONG_SWEEP_M:
         fraction, sector = _best_start(windows[0].thinned(_FEW_SCANS, _FEW_POINTS))
     found = estimate(windows, fraction, sector)
+    if not any(window.has_matches for window in windows):
+        others = tuple(replace(timing, fraction=f) for f in FRACTIONS.values() if f)
+        return SweepDecision("undecided", timing, speed_mps=speed, others=others)
     return replace(_compare_hypotheses(windows, found, timing), speed_mps=speed)
 
 

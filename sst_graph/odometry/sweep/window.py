@@ -284,8 +284,13 @@ class Window:
         around = float((weights * residuals**2).sum() - (amount * shared**2).sum())
         many = amount > _MIN_WEIGHT
         spread = 1.4826 * float(np.median(np.abs(shared[many]))) if many.any() else 0.0
-        total = float(amount.sum())
+        total = max(float(amount.sum()), 1e-9)
         return Errors(max(around / total, 1e-12), spread**2, total)
+
+    @property
+    def has_matches(self) -> bool:
+        """Whether any point met a surface."""
+        return any(len(rows.residuals) for rows in self._matches)
 
     def _stacked(self) -> tuple[IndexArray, FloatArray, FloatArray]:
         """Cells, weights and residuals of all matches."""
@@ -418,7 +423,8 @@ def _groups(cells: IndexArray) -> tuple[IndexArray, IndexArray]:
     """The order that puts equal cells together, and where in it each cell begins."""
     order = np.argsort(cells, kind="stable")
     ordered = cells[order]
-    return order, np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
+    starts = np.append(True, ordered[1:] != ordered[:-1])[: len(cells)]
+    return order, np.flatnonzero(starts)
 
 
 def _odometry(scans: Sequence[Scan]) -> tuple[bool, list[FloatArray]]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+import tracemalloc
+import warnings
 from typing import Any
 
 import cv2
@@ -180,6 +183,26 @@ def test_points_without_a_return_are_left_out_with_their_columns() -> None:
     assert cloud.left_out == 2 and len(cloud.points) == 3
     assert cloud.rings is not None and cloud.rings.tolist() == [0, 2, 4]
     assert cloud.offsets_s is not None and cloud.offsets_s[1] == np.float32(0.025)
+
+
+def test_values_beyond_32_bits_are_left_out_in_silence() -> None:
+    """Doubles that no float of 32 bits holds, and signalling NaN."""
+    rows = np.zeros(4, [("x", "<f8"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f8")])
+    rows["x"], rows["intensity"] = [1.0, 1e300, 2.0, -1e300], [1.0, 1.0, 1e300, 1.0]
+    rows["y"].view("<u4")[2] = 0x7FA00000
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        cloud = read(rows)
+    assert cloud.left_out == 3 and cloud.points.tolist() == [[1.0, 0.0, 0.0]]
+
+
+def test_the_step_of_a_single_row_takes_no_memory() -> None:
+    message = MAKE.image(STAMP_NS, BGR[:1])
+    tracemalloc.start()
+    picture = picture_of(dataclasses.replace(message, step=2**32 - 1), IMAGE, "here")
+    assert tracemalloc.get_traced_memory()[1] < 1_000_000
+    tracemalloc.stop()
+    np.testing.assert_array_equal(picture, BGR[:1])
 
 
 def test_labels_are_read_where_they_are_asked_for() -> None:
