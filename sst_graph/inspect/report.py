@@ -41,7 +41,10 @@ def summary(result: CalibrationResult, comparison: Comparison | None = None) -> 
     rows = [
         ("status", result.status),
         ("method", f"{result.method}, {_frames(result)}"),
-        ("transform", f"p_{result.camera_name} = T_camera_lidar . p_lidar"),
+        (
+            "transform",
+            f"p_{'camera' if result.image_topic else result.camera_name} = T_camera_lidar . p_lidar",
+        ),
         *(("", row) for row in _matrix_rows(result.T_camera_lidar)),
         ("sigma", _pose_sigmas(result)),
         ("time offset", f"{_offset(result)}   ({OFFSET_SIGN})"),

@@ -80,7 +80,9 @@ def report_html(inputs: ReportInputs) -> str:
         _background(inputs, inspection),
     ]
     drives = ", ".join(sorted({frame.drive for frame in result.frames_used}))
-    title = f"Calibration of {result.camera_name}" + (f" from {drives}" if drives else "")
+    title = f"Calibration of {result.image_topic or result.camera_name}" + (
+        f" from {drives}" if drives else ""
+    )
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
