@@ -201,7 +201,7 @@ def _depth_colours(depths_m: FloatArray) -> NDArray[np.uint8]:
     near, far = np.log(_DEPTHS_M)
     steps = np.clip(230.0 - 210.0 * (np.log(depths_m) - near) / (far - near), 20.0, 230.0).astype(np.uint8)
     table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_TURBO)
-    return np.asarray(table, dtype=np.uint8).reshape(256, 3)[steps]
+    return np.asarray(table.reshape(256, 3)[steps], dtype=np.uint8)
 
 
 def _draw_points(picture: Picture, uvs: FloatArray, colour: Colour | NDArray[np.uint8], size_px: int) -> None:
