@@ -155,6 +155,12 @@ class CalibrationResult:
     def __hash__(self) -> int:
         return hash(self.to_json())
 
+    @property
+    def image_topic(self) -> str:
+        """Topic of the images in a bag; empty where they came from elsewhere."""
+        topic = self.read_as.get("image_topic")
+        return topic if isinstance(topic, str) else ""
+
     def sigmas(self) -> Sigmas:
         """Standard deviations of the seven unknowns, in degrees, centimetres and milliseconds."""
         sigma = np.sqrt(np.diag(self.covariance))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -74,6 +75,35 @@ def test_results_of_several_drives_are_fused(tmp_path: Path) -> None:
     found: dict[str, Any] = {}
     exec(compile(code_of("how-to/fusing.md"), "fusing.md", "exec"), found)
     np.testing.assert_allclose(found["fused"].covariance(), turned(3).covariance / 2.0, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_simulated_bag_goes_through_the_pages_on_bags(capsys: pytest.CaptureFixture[str]) -> None:
+    page = (DOCS / "how-to/ros.md").read_text(encoding="utf-8")
+    exec(compile(code_of("how-to/ros.md"), "ros.md", "exec"), {})
+    calibrate, export = re.findall(r"^sst-graph ((?:calibrate street|export) .*)$", page, re.MULTILINE)
+    assert main(["info", "street", "--mask-topic", "/camera/mask"]) == 0
+    frames = re.search(r"by transforms (\S+) - (\S+)", capsys.readouterr().out)
+    assert frames is not None
+    assert main(shlex.split(calibrate)) == 0
+    assert main(shlex.split(export)) == 0
+    launch = Path("camera.launch.py").read_text()
+    assert all(f'"{name}"' in launch for name in frames.groups())
+
+    found: dict[str, Any] = {}
+    exec(compile(code_of("how-to/ros-node.md"), "ros-node.md", "exec"), found)
+    (printed,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("{"))
+    line = json.loads(printed)
+    assert line["time_offset_s"] == pytest.approx(0.05, abs=0.01)  # the simulator's
+
+
+@pytest.mark.slow
+def test_a_lens_in_python(tmp_path: Path) -> None:
+    (tmp_path / "drive").symlink_to(written(SimulationConfig(seed=5, frames=1, width=1242, height=375)))
+    found: dict[str, Any] = {}
+    exec(compile(code_of("how-to/cameras.md"), "cameras.md", "exec"), found)
+    source = found["source"]
+    assert source[0].image.pixels.shape[:2] == (source.camera.height, source.camera.width) > (375, 1242)
 
 
 @pytest.mark.slow

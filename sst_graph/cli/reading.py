@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from sst_graph.cli.labels import LABEL_OPTIONS, labelled
 from sst_graph.cli.messages import complain
 from sst_graph.cli.options import SOURCE_DEFAULTS
 from sst_graph.data import open_source
+from sst_graph.data.info.facts import FactsReader
 from sst_graph.errors import ConfigError, DataError, SstGraphError
 from sst_graph.files.typed_values import matches
 from sst_graph.result import CalibrationResult, result_file
@@ -38,6 +39,14 @@ def options_of(args: argparse.Namespace) -> dict[str, Any]:
     for name, value in options.items():
         setattr(args, name, value)
     return options
+
+
+def with_image_topic(read_as: Mapping[str, Any], sources: Sequence[Source]) -> dict[str, Any]:
+    """``read_as`` with the topic of the images where none was named and all drives have them on the same."""
+    if read_as["image_topic"] is not None:
+        return dict(read_as)
+    topics = {one.facts().image.topic if isinstance(one, FactsReader) else "" for one in sources}
+    return {**read_as, "image_topic": topics.pop() or None if len(topics) == 1 else None}
 
 
 def open_drive(args: argparse.Namespace, path: Path) -> Source:

@@ -26,7 +26,7 @@ from sst_graph.cli.outputs import (
     write_calibration,
 )
 from sst_graph.cli.progress import ProgressBar
-from sst_graph.cli.reading import options_of, warn_of_other_pairs
+from sst_graph.cli.reading import options_of, warn_of_other_pairs, with_image_topic
 from sst_graph.cli.video import video_of, videos_beside
 from sst_graph.errors import ConfigError
 from sst_graph.files import atomic_directory
@@ -145,7 +145,8 @@ def _calibrated(
             sources, initial, config, known, initial_time_offsets_s=offsets_s, progress=progress
         )
     results = {
-        name: dataclasses.replace(result, read_as=read_as[name]) for name, result in rig.cameras.items()
+        name: dataclasses.replace(result, read_as=with_image_topic(read_as[name], sources[name]))
+        for name, result in rig.cameras.items()
     }
     return sources, dataclasses.replace(rig, cameras=results)
 

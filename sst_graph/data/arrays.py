@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
 from sst_graph.files.reading import FileKind, read_file
+from sst_graph.validation import FARTHEST_M
 
 MAX_POINTS = 10_000_000
 """Points of a scan: a sweep of the densest spinning scanners has under one million. This many take 160 MB."""
@@ -17,9 +18,6 @@ MAX_POINTS = 10_000_000
 SCAN = FileKind("a cloud of x y z r in float32", 16 * MAX_POINTS)
 LABELS = FileKind("labels, one uint32 a point", 4 * MAX_POINTS)
 POINT_TIMES = FileKind("times, one float32 a point", 4 * MAX_POINTS)
-
-MAX_COORDINATE_M = 10_000.0
-"""Coordinates beyond this [m] mean that the file holds something else than metres in float32."""
 
 
 def listed(folder: Path, expected: str) -> list[Path]:
@@ -74,16 +72,16 @@ def read_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
 
 
 def check_metres(points: NDArray[np.float32], path: Path) -> None:
-    """Require coordinates (n, 3) that are lengths [m], but for NaN and inf.
+    """Require coordinates (n, 3) that are lengths, in whatever unit, but for NaN and inf.
 
     Raises:
-        DataError: one beyond MAX_COORDINATE_M.
+        DataError: one beyond FARTHEST_M.
     """
     lengths = np.abs(np.where(np.isfinite(points), points, 0.0))
-    if len(points) and float(lengths.max()) > MAX_COORDINATE_M:
+    if len(points) and float(lengths.max()) > FARTHEST_M:
         k = int(np.argmax(lengths.max(axis=1)))
         found = f"a coordinate of {float(lengths[k].max()):.3g} m at index {k}"
-        raise DataError(path, found, f"metres in float32, at most {MAX_COORDINATE_M:g}")
+        raise DataError(path, found, f"metres in float32, at most {FARTHEST_M:g}")
 
 
 def read_labels(path: Path, count: int) -> NDArray[np.uint32]:

@@ -31,11 +31,13 @@ class Sensor(Generic[T]):
         stamps_ns: (n,) in the sensor's own clock, rising strictly [ns].
         read: measurement k of n, stamped ``stamps_ns[k]``; DataError where its files cannot be used.
         place: where its data stand: a topic, a folder.
+        topic: name of the topic; empty where it is none.
     """
 
     stamps_ns: NDArray[np.int64]
     read: Callable[[int], T]
     place: str = ""
+    topic: str = ""
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -184,8 +186,8 @@ class TwoClockSource:
         scans = [place.scan for place in places if place.scan is not None]
         images = [place.image for place in places if place.image is not None]
         return SourceFacts(
-            SensorFacts(self.scans.place, self.scans.stamps_ns[scans]),
-            SensorFacts(self.images.place, self.images.stamps_ns[images]),
+            SensorFacts(self.scans.place, self.scans.stamps_ns[scans], self.scans.topic),
+            SensorFacts(self.images.place, self.images.stamps_ns[images], self.images.topic),
             self.properties.nominal_reason,
             self.properties.notes,
         )
@@ -257,7 +259,7 @@ def _shifted(images: Sensor[CameraImage], shift: int) -> tuple[Sensor[CameraImag
     stamps = images.stamps_ns[first : first + count]
     real = images.stamps_ns[first + shift : first + shift + count]
     shifted = _Shifted(images, first + shift, stamps)
-    return Sensor(stamps, shifted.read, images.place), float(np.mean(real - stamps)) * 1e-9
+    return Sensor(stamps, shifted.read, images.place, images.topic), float(np.mean(real - stamps)) * 1e-9
 
 
 @dataclass(frozen=True, eq=False)

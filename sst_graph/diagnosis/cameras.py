@@ -30,6 +30,5 @@ def image_size(camera: PinholeCamera) -> Finding | None:
     return Finding(
         f"the pictures are {size} the size the intrinsics were made for",
         f"cx = {camera.cx:.0f} of {camera.width} px, cy = {camera.cy:.0f} of {camera.height} px",
-        f"scale fx, fy, cx and cy by the pictures' width over the calibration's (about {scale:.2g}), "
-        "or give the pictures and masks at their full size",
+        f"scale fx, fy, cx and cy by that ratio (about {scale:.2g}), or give pictures and masks at full size",
     )

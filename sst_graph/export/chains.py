@@ -100,5 +100,5 @@ def _intrinsics(result: CalibrationResult, topic: str, pinhole: bool) -> str:
         + "  distortion_model: radtan\n"
         + "  distortion_coeffs: [0.0, 0.0, 0.0, 0.0]\n"
         + f"  resolution: [{camera.width}, {camera.height}]\n"
-        + f"  {topic}: {yaml_text('/' + result.camera_name.lstrip('/'))}\n"
+        + f"  {topic}: {yaml_text(result.image_topic or '/' + result.camera_name.lstrip('/'))}\n"
     )

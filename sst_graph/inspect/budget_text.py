@@ -15,6 +15,14 @@ from sst_graph.result import CalibrationResult
 
 FloatArray = NDArray[np.float64]
 
+_PARTS_OF_EDGES = {
+    "objects": "which objects there are",
+    "positions": "positions between the beams",
+    "shallow": "shallow upper edges",
+    "farther_edges": "edges farther away",
+    "floor": "floor",
+}
+"""Parts of a covariance by edges in words (docs/how-to/edges.md)."""
 _LEAST_SHARE = 0.01
 """Parts that give less than this share of every variance are not shown."""
 
@@ -50,11 +58,13 @@ def _parts(result: CalibrationResult) -> dict[str, FloatArray]:
     """(7,) sigmas of each part; empty where the result has none."""
     stored = result.diagnostics.get(BUDGET)
     if not isinstance(stored, dict):
+        stored = result.diagnostics.get("spread")
+    if not isinstance(stored, dict):
         return {}
-    parts = {}
+    parts: dict[str, FloatArray] = {}
     for name, sigmas in stored.items():
         if isinstance(sigmas, list) and len(sigmas) == 7 and all(_is_sigma(s) for s in sigmas):
-            parts[name] = np.array(sigmas, dtype=np.float64)
+            parts[_PARTS_OF_EDGES.get(str(name), str(name))] = np.array(sigmas, dtype=np.float64)
     return parts
 
 

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.fit import FitQuality
 from sst_graph.inspect.budget_text import budget_lines
 from sst_graph.inspect.frame_information import FrameInformation
 from sst_graph.inspect.gained_text import MOST_FRAMES, SHORT, gained_lines, short
@@ -22,7 +21,7 @@ from sst_graph.inspect.inspection import (
 from sst_graph.inspect.planning import MOST_FRAMES as MOST_RECORDED
 from sst_graph.inspect.planning import Plan, Prediction, worst_ratio
 from sst_graph.inspect.planning import limits_of as limits_of_result
-from sst_graph.inspect.verdict import quality_line
+from sst_graph.inspect.verdict import fit_line
 from sst_graph.result import CalibrationResult
 
 FloatArray = NDArray[np.float64]
@@ -123,8 +122,8 @@ def _head(result: CalibrationResult) -> list[str]:
         f"{'method':<12} {result.method}, {count}" + (f" of {', '.join(drives)}" if drives else ""),
     ]
     lines += [f"{'reason':<12} {reason}" for reason in result.reasons]
-    if (quality := FitQuality.from_diagnostics(result.diagnostics)) is not None:
-        lines.append(f"{'fit':<12} {quality_line(quality)}")
+    if fit := fit_line(result):
+        lines.append(f"{'fit':<12} {fit}")
     for drive in result.drive_offsets:
         sigma = short(1e3 * drive.sigma_s)
         lines.append(f"{'offset':<12} {drive.drive}: {1e3 * drive.time_offset_s:+.2f} ms, sigma {sigma} ms")

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from sst_graph.fit import FitQuality
 from sst_graph.inspect.budget_text import budget_lines, estimated_lines
 from sst_graph.inspect.reasons import short_reasons
-from sst_graph.inspect.verdict import quality_line, verdict
+from sst_graph.inspect.verdict import fit_line, verdict
 from sst_graph.metrics import (
     CalibrationErrors,
     euler_angles_deg,
@@ -21,6 +20,16 @@ from sst_graph.metrics import (
 from sst_graph.result import CalibrationResult
 
 OFFSET_SIGN = "t_lidar = t_camera_stamp + offset"
+
+
+_WITH_LABELS = (
+    "More frames reduce matches and motion. The others are assumptions that no residual shows, such as a "
+    "principal point (cx, cy) or a distortion (k1, k2) that is off by the amount named."
+)
+_WITHOUT_LABELS = (
+    "More objects reduce the first two lines and, in part, the fifth. The others are shared by all frames."
+)
+"""What the parts of the sigmas mean."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +50,10 @@ def summary(result: CalibrationResult, comparison: Comparison | None = None) -> 
     rows = [
         ("status", result.status),
         ("method", f"{result.method}, {_frames(result)}"),
-        ("transform", f"p_{result.camera_name} = T_camera_lidar . p_lidar"),
+        (
+            "transform",
+            f"p_{'camera' if result.image_topic else result.camera_name} = T_camera_lidar . p_lidar",
+        ),
         *(("", row) for row in _matrix_rows(result.T_camera_lidar)),
         ("sigma", _pose_sigmas(result)),
         ("time offset", f"{_offset(result)}   ({OFFSET_SIGN})"),
@@ -58,8 +70,7 @@ def summary(result: CalibrationResult, comparison: Comparison | None = None) -> 
     if comparison is not None:
         rows.append((f"against {comparison.name}", ""))
         rows += [("", line) for line in error_lines(comparison.errors)]
-    quality = FitQuality.from_diagnostics(result.diagnostics)
-    rows += [("fit", quality_line(quality))] if quality else []
+    rows += [("fit", fit)] if (fit := fit_line(result)) else []
     rows += [("reason", reason) for reason in short_reasons(result)]
     for weak in result.weak_directions:
         if not any(weak.sentence in reason for reason in result.reasons):
@@ -106,8 +117,7 @@ def markdown_report(result: CalibrationResult, comparison: Comparison | None, pi
         blocks += [
             "## Where the sigmas come from",
             "```\n" + "\n".join(parts) + "\n```",
-            "More frames reduce matches and motion. The others are assumptions that no residual shows, such "
-            "as a principal point (cx, cy) or a distortion (k1, k2) that is off by the amount named.",
+            _WITHOUT_LABELS if result.method == "edges" else _WITH_LABELS,
         ]
     if result.weak_directions:
         items = [f"- {weak.sentence} {weak.advice}" for weak in result.weak_directions]
@@ -115,8 +125,8 @@ def markdown_report(result: CalibrationResult, comparison: Comparison | None, pi
     if pictures:
         blocks += [
             "## Before and after",
-            "Above the start, below the result. "
-            "Vehicle points: green inside the image's vehicle mask, red outside; the contour is the mask's.",
+            "Above the start, below the result. Vehicle points: green inside the image's vehicle mask, red "
+            "outside; the contour is the mask's. Without labels: points by depth, red near, blue far.",
             "\n\n".join(f"![{name}]({name})" for name in pictures),
         ]
     versions = ", ".join(f"{name} {number}" for name, number in result.versions.items())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import gtsam
@@ -75,6 +76,32 @@ def quality_line(quality: FitQuality) -> str:
     return (
         f"{100.0 * quality.share:.0f} % of {quality.points} boundary points within {CLOSE_PX:g} px of the "
         f"contour{start}; labels like these allow {100.0 * quality.attainable:.0f} %"
+    )
+
+
+def fit_line(result: CalibrationResult) -> str:
+    """How well the result fits its data, as a line for a terminal: by labels, else by edges; else empty."""
+    quality = FitQuality.from_diagnostics(result.diagnostics)
+    return edges_line(result) if quality is None else quality_line(quality)
+
+
+def edges_line(result: CalibrationResult) -> str:
+    """How far the score of the edges stands out; empty where it is not known."""
+    stored = result.diagnostics.get("contrast")
+    names = "sigmas", "least_sigmas", "score", "other", "least_over_other"
+    found = [stored.get(name) for name in names] if isinstance(stored, dict) else []
+    values = [float(x) for x in found if isinstance(x, int | float) and math.isfinite(x)]
+    if len(values) < len(names):
+        return ""
+    sigmas, least_sigmas, score, other, least_over_other = values
+    over_other = (
+        f", {score / other:.2f} times that of the best other optimum ({least_over_other:g} or more expected)"
+        if other > 0.0
+        else ""
+    )
+    return (
+        f"the score of the edges is {sigmas:.0f} standard deviations above those of random rotations "
+        f"({least_sigmas:g} or more expected){over_other}"
     )
 
 

@@ -102,7 +102,7 @@ for (const root of document.querySelectorAll(".overlay")) {
   Object.assign(box, { type: "checkbox", checked: true });
   box.addEventListener("change", () => { contours = box.checked; draw(); });
   label.append(box, "contours of the labels");
-  bar.append(modes, label);
+  bar.append(modes, ...(data.contours.length ? [label] : []));
   function drawKey() {
     const entries = mode === "class" ? Object.entries(data.classes).map(([c, name]) => [hues[c] || "#9aa0a6", name])
       : mode === "residual" ? [["#39e06f", "within 1.5 px of the contour"], ["#ffc233", "1.5 to 4 px"], ["#ff4b4b", "farther"]]

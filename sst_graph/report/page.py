@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from sst_graph.assumptions import ASSUMPTIONS
-from sst_graph.fit import CLOSE_PX, Fit, FitQuality, MatchedFrame
+from sst_graph.fit import CLOSE_PX, Fit, MatchedFrame
 from sst_graph.inspect.budget_text import budget_lines
 from sst_graph.inspect.inspection import Inspection, inspect_result, strong_correlations
 from sst_graph.inspect.inspection_text import MOST_SENTENCES, advice_sentences, correlation_sentence
 from sst_graph.inspect.reasons import as_sentence, short_reasons
 from sst_graph.inspect.report import Comparison, error_lines, summary
-from sst_graph.inspect.verdict import DRIVING_MPS, figure, misfits, quality_line, verdict
+from sst_graph.inspect.verdict import DRIVING_MPS, figure, fit_line, misfits, verdict
 from sst_graph.report.close_ups import ZOOM, close_ups
 from sst_graph.report.drawn_frame import DrawnFrame, DriveReader
 from sst_graph.report.html import (
@@ -80,7 +80,9 @@ def report_html(inputs: ReportInputs) -> str:
         _background(inputs, inspection),
     ]
     drives = ", ".join(sorted({frame.drive for frame in result.frames_used}))
-    title = f"Calibration of {result.camera_name}" + (f" from {drives}" if drives else "")
+    title = f"Calibration of {result.image_topic or result.camera_name}" + (
+        f" from {drives}" if drives else ""
+    )
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
@@ -97,7 +99,7 @@ def _file(name: str) -> str:
 
 def _verdict(inputs: ReportInputs) -> str:
     result = inputs.result
-    quality = FitQuality.from_diagnostics(result.diagnostics)
+    fit = fit_line(result)
     rows = [
         (
             f"{one.depth_m:.0f} m",
@@ -122,7 +124,7 @@ def _verdict(inputs: ReportInputs) -> str:
             "in the picture. About 19 times in 20 the error is below twice as much.",
             "note",
         ),
-        paragraph(quality_line(quality)[0].upper() + quality_line(quality)[1:] + "." if quality else ""),
+        paragraph(fit[0].upper() + fit[1:] + ".") if fit else "",
         table(head, rows, "numbers"),
         paragraph(f"Errors against {inputs.comparison.name}:") if inputs.comparison else "",
         bullets(error_lines(inputs.comparison.errors)) if inputs.comparison else "",

@@ -5,6 +5,8 @@ Needs rerun-sdk (the extra ``rerun``), imported when a recording begins.
 
 from __future__ import annotations
 
+import os
+import socket
 import sys
 from collections import deque
 from pathlib import Path
@@ -47,6 +49,10 @@ _MOST_POSES = 5_000
 _LONGEST_FLUSH_S = 60.0
 """The viewer that takes nothing for so long has gone."""
 _JPEG_QUALITY = 85
+_SCREENS = "DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"
+"""Variables of the environment by which a window finds its screen on Linux."""
+_VIEWER_ADDRESS = "127.0.0.1", 9876
+"""Where a viewer listens; one that is open already is used."""
 _DEPTHS_M = 3.0, 60.0
 """Depths at the ends of the colours."""
 _WORST_PX = 5.0
@@ -185,6 +191,7 @@ class Recording:
         if save is not None:
             sinks.append(rr.FileSink(str(save)))
         if live:
+            _check_screen()
             try:
                 # Without the recording, the global one is asked, and says that it is disabled.
                 rr.spawn(connect=False, recording=self._stream, executable_path=_executable())
@@ -256,6 +263,25 @@ class Recording:
             rr.Points2D(matches.contour, colors=(255, 255, 255), radii=1.0, draw_order=42.0),
         )
         self._log("fit/residual_px", rr.Scalars([float(np.median(np.abs(matches.residuals_px)))]))
+
+
+def _check_screen() -> None:
+    """A viewer without a screen ends seconds after it has been started, and says so to nobody.
+
+    Raises:
+        ConfigError: there is no screen, and no viewer is open.
+    """
+    if sys.platform != "linux" or any(os.environ.get(name) for name in _SCREENS):
+        return
+    try:
+        socket.create_connection(_VIEWER_ADDRESS, timeout=1.0).close()
+    except OSError:
+        found = (
+            f"the viewer rerun cannot be opened: there is no screen (none of {', '.join(_SCREENS)} is set)"
+        )
+        raise ConfigError(
+            f"{found}: save a file, or open a viewer first, such as rerun --serve-web"
+        ) from None
 
 
 def _executable() -> str | None:

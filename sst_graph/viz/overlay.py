@@ -36,6 +36,9 @@ CLASS_COLOURS: dict[SemanticClass, Colour] = {
 }
 """BGR of the points by class; a class that is not named here is grey."""
 OTHER_COLOUR: Colour = (150, 150, 150)
+_DEPTHS_M = 3.0, 60.0
+"""Depths at the ends of the colours of a scan without labels [m]."""
+_LEGEND_DEPTHS_M = 3, 10, 30, 60
 
 MIN_WIDTH_PX = 720
 """Smaller pictures are enlarged by a whole factor to at least this width."""
@@ -70,15 +73,16 @@ def draw_overlay(
     """The image with the scan's points and the contours of the vehicle mask -> (h + strip, w, 3) BGR.
 
     Vehicle points are green inside the vehicle mask and red outside; the others take the colour of
-    their class. Contours follow the picture, as they do in a calibration by default, and are darker where
-    it shows no edge and nothing is matched. Points are moved to the image's instant by ``c_twist`` (6,)
-    [rad/s, m/s], the camera's twist in its own frame; None leaves them where they were at their own time.
+    their class. Those of a scan without labels take the colour of their depth. Contours follow the
+    picture, as they do in a calibration by default, and are darker where it shows no edge and nothing is
+    matched. Points are moved to the image's instant by ``c_twist`` (6,) [rad/s, m/s], the camera's twist in
+    its own frame; None leaves them where they were at their own time.
 
     Raises:
         DataError: the frame lacks its scan or its image, or the image has another size than the camera.
     """
     scan, image = _both(frame, camera)
-    uvs, classes = _projected(scan, image, camera, cTl, time_offset_s, c_twist)
+    uvs, classes, depths_m = _projected(scan, image, camera, cTl, time_offset_s, c_twist)
     zoom = -(-MIN_WIDTH_PX // camera.width)
     picture = _enlarged(_backdrop(image), zoom)
     _draw_contours(
@@ -86,13 +90,17 @@ def draw_overlay(
     )
     mask_class = _at(image.mask, uvs)[classes == SemanticClass.VEHICLE]
     uvs = (uvs + 0.5) * zoom - 0.5
+    if (scan.classes == SemanticClass.IGNORE).all():
+        _draw_points(picture, uvs, _depth_colours(depths_m), 2)
+        return np.vstack([_strip(picture.shape[1], _by_depth(caption)), picture])
     _draw_classes(picture, uvs, classes)
     vehicles = uvs[classes == SemanticClass.VEHICLE]
     inside = mask_class == SemanticClass.VEHICLE
     outside = ~inside & (mask_class != SemanticClass.IGNORE)
     _draw_points(picture, vehicles[inside], IN_MASK, 2)
     _draw_points(picture, vehicles[outside], OUT_OF_MASK, 2)
-    return np.vstack([_strip(picture.shape[1], caption, int(inside.sum()), int(outside.sum())), picture])
+    words = _by_class(caption, int(inside.sum()), int(outside.sum()))
+    return np.vstack([_strip(picture.shape[1], words), picture])
 
 
 def before_after(
@@ -138,8 +146,8 @@ def _projected(
     cTl: gtsam.Pose3,
     time_offset_s: float,
     c_twist: FloatArray | None,
-) -> tuple[FloatArray, NDArray[np.uint8]]:
-    """Pixels (m, 2) and classes (m,) of the points that fall on the image, far ones first."""
+) -> tuple[FloatArray, NDArray[np.uint8], FloatArray]:
+    """Pixels (m, 2), classes (m,) and depths (m,) [m] of the points on the image, far ones first."""
     cPs = _transformed(cTl, scan.points.astype(np.float64))
     if c_twist is not None:
         tau = (image.stamp_ns - scan.stamp_ns) * 1e-9 + time_offset_s
@@ -149,7 +157,7 @@ def _projected(
     seen = np.flatnonzero(camera.in_front(cPs))
     seen = seen[camera.in_image(uvs[seen])]
     seen = seen[np.argsort(-cPs[seen, 2])]
-    return uvs[seen], scan.classes[seen]
+    return uvs[seen], scan.classes[seen], cPs[seen, 2]
 
 
 def _moved(cPs: FloatArray, taus_s: FloatArray, c_twist: FloatArray) -> FloatArray:
@@ -188,8 +196,16 @@ def _draw_classes(picture: Picture, uvs: FloatArray, classes: NDArray[np.uint8])
             _draw_points(picture, uvs[classes == label], colour, 1)
 
 
-def _draw_points(picture: Picture, uvs: FloatArray, colour: Colour, size_px: int) -> None:
-    """Squares of ``size_px`` at pixels (n, 2)."""
+def _depth_colours(depths_m: FloatArray) -> NDArray[np.uint8]:
+    """(n, 3) BGR, from red (near) to blue."""
+    near, far = np.log(_DEPTHS_M)
+    steps = np.clip(230.0 - 210.0 * (np.log(depths_m) - near) / (far - near), 20.0, 230.0).astype(np.uint8)
+    table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_TURBO)
+    return np.asarray(table.reshape(256, 3)[steps], dtype=np.uint8)
+
+
+def _draw_points(picture: Picture, uvs: FloatArray, colour: Colour | NDArray[np.uint8], size_px: int) -> None:
+    """Squares of ``size_px`` at pixels (n, 2), in one colour or in (n, 3) BGR."""
     height, width = picture.shape[:2]
     columns, rows = np.floor(uvs + 0.5).astype(np.int64).T
     for right in range(size_px):
@@ -216,18 +232,33 @@ def _at(mask: NDArray[np.uint8], uvs: FloatArray) -> NDArray[np.uint8]:
     return np.asarray(mask[rows, columns])
 
 
-def _strip(width: int, caption: str, inside: int, outside: int) -> Picture:
-    """A strip of ``width`` pixels with the caption and the legend, in letters that fit."""
+def _by_class(caption: str, inside: int, outside: int) -> list[tuple[str, Colour]]:
+    """The legend of a scan with labels."""
     total = inside + outside
     share = f"{100.0 * inside / total:.1f} % of {total}" if total else "none of them"
-    parts: list[tuple[str, Colour]] = [
-        (f"{caption}   " if caption else "", (255, 255, 255)),
-        (f"vehicle points in the mask: {share}   ", IN_MASK),
-        (f"outside: {outside}   ", OUT_OF_MASK),
-        ("contour   ", CONTOUR),
+    return [
+        (caption, (255, 255, 255)),
+        (f"vehicle points in the mask: {share}", IN_MASK),
+        (f"outside: {outside}", OUT_OF_MASK),
+        ("contour", CONTOUR),
         ("not matched", NOT_ASKED),
     ]
-    text = "".join(words for words, _ in parts)
+
+
+def _by_depth(caption: str) -> list[tuple[str, Colour]]:
+    """The legend of a scan without labels."""
+    colours = _depth_colours(np.array(_LEGEND_DEPTHS_M, dtype=np.float64)).tolist()
+    shown = [
+        (f"{depth_m} m", (int(blue), int(green), int(red)))
+        for depth_m, (blue, green, red) in zip(_LEGEND_DEPTHS_M, colours, strict=True)
+    ]
+    return [(caption, (255, 255, 255)), ("points by depth:", (255, 255, 255)), *shown]
+
+
+def _strip(width: int, legend: list[tuple[str, Colour]]) -> Picture:
+    """A strip of ``width`` pixels with words in their colours, in letters that fit."""
+    parts = [(f"{words}   ", colour) for words, colour in legend if words]
+    text = "".join(words for words, _ in parts).rstrip()
     font, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.6
     (length, height), _ = cv2.getTextSize(text, font, scale, 1)
     scale *= min(1.0, (width - 16) / length)

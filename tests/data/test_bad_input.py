@@ -296,6 +296,13 @@ def test_a_drive_without_any_label_is_no_surprise(drive: Path, caplog: pytest.Lo
     assert not caplog.records
 
 
+def test_a_cloud_in_millimetres_is_read_for_the_diagnosis_to_name_its_unit(drive: Path) -> None:
+    """Of 85 m."""
+    coordinate(3, 85_000.0)(drive)
+    scan = open_source(drive)[2].scan
+    assert scan is not None and scan.left_out == 0 and float(scan.points[3, 1]) == 85_000.0
+
+
 @pytest.mark.parametrize("value", [np.nan, -np.inf])
 def test_points_that_are_no_numbers_are_left_out_with_their_labels_and_times(
     drive: Path, value: float

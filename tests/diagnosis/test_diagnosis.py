@@ -25,6 +25,7 @@ from sst_graph.drive.preparation import Drive
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.mask_shift import contour_profiles, mask_shift
+from sst_graph.inspect.reasons import short_reason
 from sst_graph.odometry.sweep import SweepDecision
 from sst_graph.simulator import SimulationConfig
 from sst_graph.sweep_timing import SweepTiming
@@ -266,6 +267,8 @@ def test_pictures_of_another_size(scale: float, name: str) -> None:
     camera = PinholeCamera(721.0, 721.0, 609.6, 172.9, round(1242 * scale), round(375 * scale))
     finding = image_size(camera)
     assert finding is not None and f"the pictures are {name} the size" in finding.cause
+    short = short_reason(finding.sentence)
+    assert short.endswith("give pictures and masks at full size"), short  # the remedy is whole
     # The principal point determines the ratio to some per cent only.
     ratio = re.search(r"\(about ([0-9.]+)\)", finding.check)
     assert ratio is not None and abs(float(ratio[1]) / scale - 1.0) < 0.05

@@ -25,6 +25,11 @@ def test_a_part_is_a_line() -> None:
 
 
 @pytest.mark.filterwarnings("error")
+def test_parts_of_a_covariance_by_edges_are_named_in_words() -> None:
+    lines = budget_lines(_result({"spread": {"objects": [0.001] * 7, "samples": 16}}))
+    assert len(lines) == 2 and lines[1].split("0.057 deg")[0].strip() == "which objects there are"
+
+
 @pytest.mark.parametrize("value", [1e300, 10**400, float("inf"), float("nan"), -1.0, True, "1", None])
 def test_what_is_no_sigma_is_left_out(value: Any) -> None:
     diagnostics = {BUDGET: {"focal": [value] * 7}, "estimated": {"focal": {"value": value, "sigma": 1.0}}}

@@ -11,7 +11,7 @@ import pytest
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.fit import FitQuality
 from sst_graph.inspect.reasons import MOST_LETTERS, as_sentence, short_reason, short_reasons
-from sst_graph.inspect.verdict import largest_sigmas, misfits, quality_line, verdict
+from sst_graph.inspect.verdict import fit_line, largest_sigmas, misfits, quality_line, verdict
 from sst_graph.odometry.sweep import REMEDY
 from sst_graph.result import CalibrationResult
 
@@ -133,3 +133,16 @@ def test_quality_in_one_line() -> None:
         "these allow 85 %"
     )
     assert "start" not in quality_line(FitQuality(3412, 0.842, None, 0.851))
+
+
+def test_without_labels_the_fit_is_how_far_the_edges_stand_out() -> None:
+    contrast = {"score": 120.0, "sigmas": 18.95, "ratio": 7.0, "other": 0.0}
+    expected = {"least_sigmas": 6.0, "least_over_other": 1.08}
+    alone = _result([0.01] * 7, diagnostics={"contrast": contrast | expected})
+    line = "the score of the edges is 19 standard deviations above those of random rotations"
+    line += " (6 or more expected)"
+    assert fit_line(alone) == line
+    other = _result([0.01] * 7, diagnostics={"contrast": contrast | expected | {"other": 100.0}})
+    assert fit_line(other) == line + ", 1.20 times that of the best other optimum (1.08 or more expected)"
+    for stored in (None, {}, contrast, contrast | expected | {"sigmas": "many"}):
+        assert fit_line(_result([0.01] * 7, diagnostics={"contrast": stored})) == ""

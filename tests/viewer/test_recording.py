@@ -171,13 +171,23 @@ def test_the_tracker_is_logged_and_not_changed(
     assert said[0].startswith("starting") and any(text.startswith(last.status) for text in said)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a viewer needs no display server")
+def test_without_a_screen_no_viewer_is_started(
+    street: SimulatedDrive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(ConfigError, match=r"cannot be opened: there is no screen .*: save a file"):
+        Recording(street.camera, live=True, save=None, tracked=False)
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a viewer needs no display server")
-def test_a_viewer_without_a_screen_ends_in_one_line(
+def test_a_viewer_that_ends_is_told_in_one_line(
     street: SimulatedDrive, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The real viewer is started, finds no screen and ends; nothing waits for it for ever."""
-    monkeypatch.delenv("DISPLAY", raising=False)
+    """The real viewer is started, finds no such screen and ends; nothing waits for it for ever."""
+    monkeypatch.setenv("DISPLAY", ":987")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     views = list(views_under(frames[:2], street.camera, *_truth(street), CAR))
     with (

@@ -45,6 +45,17 @@ def test_vehicle_points_are_green_inside_and_red_outside_the_mask() -> None:
     assert _pixels_of(picture, OUT_OF_MASK) == {(500, 100), (501, 100), (500, 101), (501, 101)}
 
 
+def test_points_without_labels_are_drawn_by_depth() -> None:
+    """Red near and blue far: at 4 and at 50 m."""
+    frame = _frame([[0, 0, 4], [10, 0, 50]], [SemanticClass.IGNORE] * 2)
+    image = draw_overlay(frame, CAMERA, WHERE, 0.0)[-200:]
+    near, far = image[100, 400].astype(int), image[100, 500].astype(int)
+    assert near[2] > near[0] + 100 and far[0] > far[2] + 100  # BGR
+    # One point with a label, and the legend is that of the classes again.
+    labelled = replace(frame, scan=replace(frame.scan, classes=np.array([SemanticClass.GROUND, 0], np.uint8)))
+    assert not np.array_equal(draw_overlay(labelled, CAMERA, WHERE, 0.0)[-200:][100, 400], image[100, 400])
+
+
 def test_the_contour_follows_the_picture_and_is_dark_where_it_shows_nothing() -> None:
     """The object is drawn two pixels inside its mask's left side, and has no lower side to be seen."""
     frame = _frame([[0, 0, 10]], [SemanticClass.VEHICLE])

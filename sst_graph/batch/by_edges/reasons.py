@@ -62,8 +62,8 @@ class EdgeContrast:
     other: float
 
     def to_dict(self) -> dict[str, float]:
-        """JSON-able."""
-        return asdict(self)
+        """JSON-able, with what is expected of an estimate that is right."""
+        return {**asdict(self), "least_sigmas": MIN_CONTRAST, "least_over_other": MIN_OVER_OTHER}
 
 
 def edge_contrast(

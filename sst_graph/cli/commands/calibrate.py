@@ -23,7 +23,7 @@ from sst_graph.cli.outputs import (
     write_calibration,
 )
 from sst_graph.cli.progress import ProgressBar
-from sst_graph.cli.reading import options_of, warn_of_other_pairs
+from sst_graph.cli.reading import options_of, warn_of_other_pairs, with_image_topic
 from sst_graph.cli.rig import given_cameras, refuse_rig_options, run_rig
 from sst_graph.cli.video import videos_beside
 from sst_graph.files import atomic_directory
@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
             warn_of_other_pairs(args.init, read_as)
             initial, time_offset_s = starting_point(args.init, sources[0], args.camera)
             result, against = calibrate_drives(sources, initial, time_offset_s, config, args.camera)
-            result = dataclasses.replace(result, read_as=read_as)
+            result = dataclasses.replace(result, read_as=with_image_topic(read_as, sources))
             # The numbers first: what follows may find the disk full.
             if not args.json:
                 mention(summary(result, against))

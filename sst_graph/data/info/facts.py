@@ -16,10 +16,12 @@ class SensorFacts:
     Attributes:
         place: where its data stand: a topic, a folder.
         stamps_ns: (n,) stamps of all its messages or files, in its own clock, rising [ns].
+        topic: name of the topic; empty where it is none.
     """
 
     place: str
     stamps_ns: NDArray[np.int64]
+    topic: str = ""
 
 
 @dataclass(frozen=True, eq=False)

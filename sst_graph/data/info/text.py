@@ -57,15 +57,20 @@ def _sensor(sensor: SensorInfo) -> str:
 def _masks(images: ImageInfo) -> str:
     if not images.masks:
         return "no masks"
-    share, pixels = round(100 * images.masks), round(100 * images.labelled_pixels)
-    return f"masks of {share} % of the images, {pixels} % of all pixels: {', '.join(images.classes)}"
+    share, pixels = _share(images.masks), _share(images.labelled_pixels)
+    return f"masks of {share} of the images, {pixels} of all pixels: {', '.join(images.classes)}"
 
 
 def _points(scans: ScanInfo) -> str:
     if not scans.labelled_scans:
         return "no labels of points"
-    share, points = round(100 * scans.labelled_scans), round(100 * scans.labelled_points)
-    return f"labels in {share} % of the scans, {points} % of all points: {', '.join(scans.classes)}"
+    share, points = _share(scans.labelled_scans), _share(scans.labelled_points)
+    return f"labels in {share} of the scans, {points} of all points: {', '.join(scans.classes)}"
+
+
+def _share(share: float) -> str:
+    """Per cent; of a sample, which tells all and none, and else about how many."""
+    return f"{round(100 * share)} %" if share in (0.0, 1.0) else f"about {round(100 * share)} %"
 
 
 def _cloud(scans: ScanInfo) -> str:

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.data.arrays import MAX_COORDINATE_M, MAX_POINTS
+from sst_graph.data.arrays import MAX_POINTS
 from sst_graph.errors import DataError
+from sst_graph.validation import FARTHEST_M
 
 POINT_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """NumPy's names of sensor_msgs/PointField datatypes."""
@@ -67,9 +68,9 @@ def _cloud(table: NDArray[Any], stamp_ns: int, place: str, times: bool, labels: 
     # Drivers give NaN or the origin for beams without a return.
     used = np.isfinite(points).all(axis=1) & (points != 0.0).any(axis=1)
     table, points = table[used], np.ascontiguousarray(points[used])
-    if len(points) and float(np.abs(points).max()) > MAX_COORDINATE_M:
+    if len(points) and float(np.abs(points).max()) > FARTHEST_M:
         found = f"a coordinate of {float(np.abs(points).max()):.3g} m"
-        raise DataError(place, found, f"at most {MAX_COORDINATE_M:g} m")
+        raise DataError(place, found, f"at most {FARTHEST_M:g} m")
     return Cloud(
         points,
         _rings(table),

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sst_graph.cameras import Rectification
 from sst_graph.classes import MaskEncoding, guess_mask_encoding
 from sst_graph.data.rectified import RectifiedSource
-from sst_graph.data.ros.bag import Bag
+from sst_graph.data.ros.bag import Bag, Topic
 from sst_graph.data.ros.camera_info import image_geometry
 from sst_graph.data.ros.frames import CloudReading, check_size, mask_classes, scan_of
 from sst_graph.data.ros.images import mask_of, picture_of
@@ -131,10 +131,14 @@ def open_ros(path: Path, options: SourceOptions) -> Source:
         notes.append(f"{index.repeated} messages with the stamp of another were left out")
     model, name = geometry.model, printable(path.stem if path.is_file() else path.name)
     properties = DriveProperties(name, model.intrinsics, nominal, nominal_reason=reason, notes=tuple(notes))
-    scans = Sensor(_stamps(index.clouds), messages.scan, f"{topics.cloud.name} ({topics.cloud.type})")
-    images = Sensor(_stamps(index.images), messages.image, f"{topics.image.name} ({topics.image.type})")
+    scans = Sensor(_stamps(index.clouds), messages.scan, _place_of(topics.cloud), topics.cloud.name)
+    images = Sensor(_stamps(index.images), messages.image, _place_of(topics.image), topics.image.name)
     drive = merged(properties, scans, images, options, path)
     return drive if model.is_pinhole else RectifiedSource(drive, Rectification.of(model))
+
+
+def _place_of(topic: Topic) -> str:
+    return f"{topic.name} ({topic.type})"
 
 
 def _stamps(stamped: Sequence[Stamped]) -> NDArray[np.int64]:

@@ -11,9 +11,10 @@ from stored import written
 
 pytest.importorskip("rosbags")
 
-from bags import EPOCH_NS, KINDS, MASK, Kind, bag_of, files_of
+from bags import EPOCH_NS, IMAGE, KINDS, MASK, Kind, bag_of, files_of
 
 from sst_graph.batch import calibrate
+from sst_graph.cli import main
 from sst_graph.cli.pictures import ShownFrame, overlay, telling_positions
 from sst_graph.data import KittiSource, open_source
 from sst_graph.data.frame_parts import RecentReader
@@ -121,6 +122,24 @@ def test_calibration_from_the_bag_is_that_of_the_drive(
     assert float(np.abs(difference).max()) < 1e-6
     assert abs(from_bag.time_offset_s - from_drive.time_offset_s) < 1e-6
     np.testing.assert_allclose(from_bag.covariance, from_drive.covariance, rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_the_result_names_the_topic_of_its_images(
+    bags: dict[Kind, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag, result = str(bags["mcap"]), str(tmp_path / "result")
+    command = ["calibrate", bag, "--mask-topic", MASK, "--sweep", "compensated", "--out", result]
+    assert main(command) in (0, 3)
+    assert "p_camera = T_camera_lidar . p_lidar" in capsys.readouterr().out
+    assert f"<h1>Calibration of {IMAGE} from mcap</h1>" in (tmp_path / "result/report.html").read_text()
+
+    yaml = pytest.importorskip("yaml")
+    assert main(["export", result, "--to", "kalibr", "--force"]) == 0
+    assert yaml.safe_load(capsys.readouterr().out)["cam0"]["rostopic"] == IMAGE
+    # The topic holds for the drive when it is read again.
+    assert main(["overlay", result, bag, "--image-topic", "/rear/image_rect"]) == 2
+    assert f"was made with --image-topic {IMAGE}" in capsys.readouterr().err
 
 
 @pytest.mark.slow
