@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from sst_graph.assumptions import ASSUMPTIONS, named_sigmas
 from sst_graph.batch.assumption_tests import ParameterTest, few_objects_factor
 from sst_graph.batch.by_edges.covariance import half_sample_steps
-from sst_graph.batch.by_edges.optimum import START_KERNELS_PX, newton_ascent_steps
-from sst_graph.batch.by_edges.solution import solution_steps
+from sst_graph.batch.by_edges.optimum import START_KERNELS_PX
+from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX, solution_steps
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.covariance.shared_errors import FEWEST
 from sst_graph.errors import EstimationError
@@ -115,7 +115,8 @@ def lens_steps(
     start = replace(state, nuisances={**state.nuisances, **dict.fromkeys(names, 0.0)})
     try:
         wide = yield from solution_steps(free, start, START_KERNELS_PX)
-        found, _ = yield from newton_ascent_steps(free, wide.state, None)
+        near = yield from solution_steps(free, wide.state, NEAR_KERNELS_PX)
+        found = (yield from solution_steps(free, near.state, NEAR_KERNELS_PX)).state
     except EstimationError:
         return LensTest()
     _, steps = yield from half_sample_steps(free, found, objects)

@@ -100,12 +100,12 @@ def best_optimum_steps(
         EstimationError: too few matches.
     """
     wide = yield from solution_steps(problem.whole, start, KERNELS_PX, progress)
-    best, best_score = yield from newton_ascent_steps(problem.whole, wide.state, progress)
+    best, best_score = yield from _newton_ascent(problem.whole, wide.state, progress)
     for _ in range(restarts):
         other = yield from _better_nearby(problem, best)
         if other is None:
             break
-        again, found_score = yield from newton_ascent_steps(problem.whole, other, progress)
+        again, found_score = yield from _newton_ascent(problem.whole, other, progress)
         if found_score < _BETTER * best_score:
             break
         best, best_score = again, found_score
@@ -120,7 +120,7 @@ def _better_nearby(problem: EdgesProblem, state: State) -> Stepwise[State | None
     found = []
     for start in starts:
         try:
-            found.append((yield from newton_ascent_steps(problem.some, start, None)))
+            found.append((yield from _newton_ascent(problem.some, start, None)))
         except EstimationError:
             if start is state:
                 return None
@@ -129,7 +129,7 @@ def _better_nearby(problem: EdgesProblem, state: State) -> Stepwise[State | None
     return other if found_score >= _BETTER * own else None
 
 
-def newton_ascent_steps(
+def _newton_ascent(
     problem: JointProblem, start: State, progress: Progress | None
 ) -> Stepwise[tuple[State, float]]:
     """A state near the optimum that a start leads to, and its score, by few long steps: each point is matched
