@@ -342,3 +342,10 @@ def test_pictures_of_another_street_are_not_trusted() -> None:
     for frame in frames:
         assert tracker.add(frame).status != "ok"
     assert tracker.optimize().status != "ok"
+
+
+def test_a_result_says_why_there_is_no_start() -> None:
+    street = simulated(TRACKED_STREET)
+    tracker = Tracker(street.camera, config("edges"), street.truth.cTl)
+    tracker.initializer.failed("no LiDAR edge in any picture")
+    assert tracker.result().reasons[-1] == "no LiDAR edge in any picture"
