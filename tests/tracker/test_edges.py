@@ -316,7 +316,7 @@ def tracked(source: Source, initial: gtsam.Pose3) -> tuple[Tracker, TrackUpdate]
     ("name", "status"), [("own-504", "ok"), ("own-507", "ok"), ("third-901", "contradicted")]
 )
 def test_a_street_without_labels(name: str, status: str) -> None:
-    """The last moves by 3.6 cm where edges farther away are met: right, and not trusted."""
+    """The last moves by 3.5 cm where edges farther away are met: right, and not trusted."""
     street = source_of(name)
     truth = street.truth
     assert truth is not None and truth.time_offset_s is not None
