@@ -33,6 +33,8 @@ def tracker_result(
         reasons = _unconfirmed(last, tracker.monitor.changes)
     elif last.status != "ok":
         reasons = (f"the tracker is {last.status}: no estimate of the calibration as it is now",)
+        if estimate.edges is not None and tracker.initializer.why:
+            reasons = (*reasons, tracker.initializer.why)
     if last.undecided_sweep:
         reasons = (*reasons, last.undecided_sweep)
     entries = {} if estimate.smoother is None else estimate.smoother.entries

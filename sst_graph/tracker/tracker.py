@@ -249,8 +249,9 @@ class Tracker:
         try:
             initialization = self.initializer.work(self.matcher)
         except NUMERICAL_ERRORS as error:
-            self.initializer.failed()
-            return make_update(self, stamp_ns, f"no start yet: {' '.join(str(error).split())}")
+            why = " ".join(str(error).split())
+            self.initializer.failed(why)
+            return make_update(self, stamp_ns, f"no start yet: {why}")
         if initialization is not None:
             return self._begin(initialization, stamp_ns)
         under_way = self.initializer.under_way
@@ -264,6 +265,7 @@ class Tracker:
             initialization = self.initializer.finish(self.matcher)
         except NUMERICAL_ERRORS as error:
             _LOG.warning("tracker: no start: %s", error)
+            self.initializer.why = " ".join(str(error).split())
             return False
         if initialization is not None:
             self._begin(initialization, self.inputs.window.last_stamp_ns or 0)

@@ -55,15 +55,17 @@ def config(method: str, **further: int) -> TrackerConfig:
     return TrackerConfig(calibration=CalibrationConfig(method=method), **further)  # type: ignore[arg-type]
 
 
-def begun(method: str, labelled: int, frames: int = FRAMES) -> Tracker:
+def begun(method: str, labelled: int, **further: int) -> Tracker:
     """A tracker that goes on from the truth over some frames, the first of them with labels.
 
     A start on so few frames is not what is tested: the graph is made at the truth.
     """
     street = simulated(TRACKED_STREET)
-    tracker = Tracker(street.camera, config(method), street.truth.cTl, street.truth.time_offset_s or 0.0)
+    tracker = Tracker(
+        street.camera, config(method, **further), street.truth.cTl, street.truth.time_offset_s or 0.0
+    )
     tracker.initializer.work = lambda matcher: None  # type: ignore[method-assign]
-    for position in range(frames):
+    for position in range(FRAMES):
         frame = street[position]
         tracker.add(frame if position < labelled else without_labels(frame))
     del tracker.initializer.work
@@ -135,6 +137,19 @@ def test_edges_decide_where_they_are_alone() -> None:
     share = by_edges().estimate.uncertainty.edge_share
     assert share.shape == (7, 7)
     np.testing.assert_allclose(np.diag(share)[:3], 1.0, atol=0.02)
+
+
+def test_scans_that_leave_the_window_keep_what_edges_share() -> None:
+    tracker, street = begun("edges", 0, window=FRAMES, start_scans=4), simulated(TRACKED_STREET)
+    for position in range(FRAMES, FRAMES + 6):
+        update = tracker.add(without_labels(street[position]))
+        assert update.accepted and update.status != "starting"
+    smoother = tracker.estimate.smoother
+    assert smoother is not None and len(smoother.entries) <= FRAMES and smoother.sums.weight > 0.0
+    np.testing.assert_allclose(np.diag(tracker.estimate.uncertainty.edge_share)[:3], 1.0, atol=0.02)
+    late = update.time_offset_s - (street.truth.time_offset_s or 0.0)
+    step = np.append(street.truth.cTl.localCoordinates(update.T_camera_lidar), late)
+    assert (np.abs(step) < 4.0 * update.sigmas).all()
 
 
 def test_in_a_frame_with_labels_nothing_is_matched_by_edges() -> None:
@@ -297,13 +312,16 @@ def tracked(source: Source, initial: gtsam.Pose3) -> tuple[Tracker, TrackUpdate]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["own-504", "own-507", "third-901"])
-def test_a_street_without_labels(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "status"), [("own-504", "ok"), ("own-507", "ok"), ("third-901", "contradicted")]
+)
+def test_a_street_without_labels(name: str, status: str) -> None:
+    """The last moves by 3.5 cm where edges farther away are met: right, and not trusted."""
     street = source_of(name)
     truth = street.truth
     assert truth is not None and truth.time_offset_s is not None
     _, update = tracked(street, truth.cTl.retract(start_step(name)))
-    assert update.status == "ok"
+    assert update.status == status
     step = np.append(
         truth.cTl.localCoordinates(update.T_camera_lidar), update.time_offset_s - truth.time_offset_s
     )
@@ -324,3 +342,10 @@ def test_pictures_of_another_street_are_not_trusted() -> None:
     for frame in frames:
         assert tracker.add(frame).status != "ok"
     assert tracker.optimize().status != "ok"
+
+
+def test_a_result_says_why_there_is_no_start() -> None:
+    street = simulated(TRACKED_STREET)
+    tracker = Tracker(street.camera, config("edges"), street.truth.cTl)
+    tracker.initializer.failed("no LiDAR edge in any picture")
+    assert tracker.result().reasons[-1] == "no LiDAR edge in any picture"

@@ -158,6 +158,7 @@ class Initializer:
         alarmed: there was an alarm, and no estimate since.
         search: the batch solution that is under way.
         graph: the graph that is being made at a solution.
+        why: the last attempt has failed; empty where none has.
         work_per_frame: done with each frame; None: all with one, which takes seconds.
     """
 
@@ -167,6 +168,7 @@ class Initializer:
         self.alarmed = False
         self.search: Search | None = None
         self.graph: InitialGraph | None = None
+        self.why = ""
         self.work_per_frame: int | None = _WORK_PER_FRAME
 
     def restart(self, guess: Guess, scans: int, alarmed: bool) -> None:
@@ -280,9 +282,9 @@ class Initializer:
             with suppress(*NUMERICAL_ERRORS):
                 self.search.advance(0)
 
-    def failed(self) -> None:
+    def failed(self, why: str) -> None:
         """An attempt has failed; after some, all of the surroundings of the guess are searched."""
-        self.attempts += 1
+        self.attempts, self.why = self.attempts + 1, why
         self.search = self.graph = None
         if self.attempts >= _MAX_ATTEMPTS:
             self.guess = Guess(self.guess.cTl, self.guess.time_offset_s)
