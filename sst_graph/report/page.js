@@ -92,7 +92,9 @@ for (const root of document.querySelectorAll(".overlay")) {
   const modes = document.createElement("fieldset"), legend = document.createElement("legend");
   legend.textContent = "colour by"; modes.append(legend);
   const group = `mode-${[...document.querySelectorAll(".overlay")].indexOf(root)}`;
-  for (const name of ["depth", "class", ...(hasResiduals ? ["residual"] : [])]) {
+  const hasClasses = Object.keys(data.classes).length > 1;
+  const names = ["depth", ...(hasClasses ? ["class"] : []), ...(hasResiduals ? ["residual"] : [])];
+  for (const name of names) {
     const label = document.createElement("label"), radio = document.createElement("input");
     Object.assign(radio, { type: "radio", name: group, value: name, checked: name === mode });
     radio.addEventListener("change", () => { mode = name; draw(); });
@@ -102,7 +104,7 @@ for (const root of document.querySelectorAll(".overlay")) {
   Object.assign(box, { type: "checkbox", checked: true });
   box.addEventListener("change", () => { contours = box.checked; draw(); });
   label.append(box, "contours of the labels");
-  bar.append(modes, ...(data.contours.length ? [label] : []));
+  bar.append(...(names.length > 1 ? [modes] : []), ...(data.contours.length ? [label] : []));
   function drawKey() {
     const entries = mode === "class" ? Object.entries(data.classes).map(([c, name]) => [hues[c] || "#9aa0a6", name])
       : mode === "residual" ? [["#39e06f", "within 1.5 px of the contour"], ["#ffc233", "1.5 to 4 px"], ["#ff4b4b", "farther"]]
