@@ -2,8 +2,8 @@
 
 These are the batch's own: the score of the estimate must stand out from those of random rotations around it
 (:mod:`sst_graph.batch.by_edges.reasons`); the scans are solved again with half of their objects, with edges
-farther away, and without upper edges that may be no outline (:mod:`sst_graph.batch.by_edges.covariance`), and
-with the lens free (:mod:`sst_graph.batch.by_edges.lens`).
+farther away, and without upper edges that may be no outline (:mod:`sst_graph.batch.by_edges.covariance`).
+The lens is not tested (:mod:`sst_graph.batch.by_edges.lens`).
 """
 
 from __future__ import annotations
@@ -14,11 +14,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.batch.by_edges.covariance import FLOOR, few_edges, half_sample_steps, outline_steps
-from sst_graph.batch.by_edges.lens import lens_steps
+from sst_graph.batch.by_edges.covariance import few_edges, half_sample_steps, outline_steps
 from sst_graph.batch.by_edges.reasons import contrast_reasons, edge_contrast_steps, wider_kernel_reasons
 from sst_graph.batch.by_edges.solution import WIDER_KERNEL_PX, solution_steps
-from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.covariance.shared_errors import spread_covariance
 from sst_graph.graph.matching import edges_of
 from sst_graph.graph.outer_loop import JointProblem
@@ -41,8 +39,7 @@ class EdgeReview:
     Attributes:
         reasons: why the estimate may be wrong altogether; none where nothing says so.
         spread: (7, 7) covariance of an estimate from these scans by what differs from object to object.
-        farther: (7, 7) covariance by edges farther away, by upper edges that may be no outline, and by a lens
-            that is a little off.
+        farther: (7, 7) covariance by edges farther away, and by upper edges that may be no outline.
     """
 
     reasons: tuple[str, ...] = ()
@@ -54,7 +51,6 @@ def review_steps(
     problem: JointProblem,
     state: State,
     objects: Mapping[ObjectId, int],
-    assumptions: AssumptionConfig,
     seed: int,
 ) -> Stepwise[EdgeReview]:
     """The review of an estimate, step by step.
@@ -62,7 +58,6 @@ def review_steps(
     Args:
         problem: of one drive.
         objects: tracks of its objects.
-        assumptions: what is assumed of the lens.
         seed: of the random rotations.
 
     Raises:
@@ -77,16 +72,10 @@ def review_steps(
     halves, _ = yield from half_sample_steps(problem, state, [dict(objects)])
     outlines = yield from outline_steps(problem, state)
     farther = np.outer(step, step) + (0.0 if outlines is None else np.outer(outlines, outlines))
-    lens = yield from lens_steps(problem, state, [dict(objects)], assumptions)
+    reasons = (*contrast_reasons(contrast), *wider_kernel_reasons(step), *few_edges(halves, outlines))
     known = np.isfinite(halves).all(axis=1).any()
     spread = spread_covariance(halves) if known else np.zeros((7, 7))
-    reasons = (
-        *lens.reasons(spread + farther + np.diag(FLOOR**2)),
-        *contrast_reasons(contrast),
-        *wider_kernel_reasons(step),
-        *few_edges(halves, outlines),
-    )
-    return EdgeReview(reasons, spread, np.asarray(farther + lens.covariance))
+    return EdgeReview(reasons, spread, np.asarray(farther))
 
 
 def softness(review: EdgeReview, covariance: FloatArray) -> float:

@@ -68,9 +68,7 @@ class Review:
             drive, calibration = of_kind(self.stretch.drive, edges=True), self.config.calibration
             tracks = Tracks([drive]).with_objects(self.stretch.tracks, self.stretch.dynamic)
             problem = JointProblem([drive], tracks, calibration.joint, self.known.state, self.known.factor())
-            steps = review_steps(
-                problem, self.state, self.stretch.tracks, calibration.assumptions, calibration.seed
-            )
+            steps = review_steps(problem, self.state, self.stretch.tracks, calibration.seed)
             self._run = Run(steps)
         self.work += work or 0
         return self._run.until(None if work is None else self.work)

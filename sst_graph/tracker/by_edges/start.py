@@ -63,8 +63,7 @@ def first_edge_estimate_steps(
     reasons = edges_reasons(solution, contrast, motion, np.diag(_START_SIGMAS**2), problem.centre)
     if stretch.at_end:
         return FirstEstimate(_point(state, config), problem.known, EdgeReview(reasons), reviewed=False)
-    assumptions = calibration.assumptions
-    review = yield from review_steps(problem.whole, state, stretch.tracks, assumptions, calibration.seed)
+    review = yield from review_steps(problem.whole, state, stretch.tracks, calibration.seed)
     if reasons := tuple(dict.fromkeys((*reasons, *review.reasons))):
         raise EstimationError("; ".join(reasons))
     return FirstEstimate(_point(state, config), problem.known, review)
