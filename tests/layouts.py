@@ -84,6 +84,14 @@ def as_kitti_raw(odometry: Path, root: Path) -> Path:
     return drive
 
 
+def without_label_files(drive: Path, root: Path) -> None:
+    """Links to what a drive is without its labels: clouds, pictures, stamps and intrinsics."""
+    stored, bare = (folder / "sequences" / "00" for folder in (drive, root))
+    bare.mkdir(parents=True)
+    for part in ("velodyne", "image_2", "times.txt", "calib.txt"):
+        (bare / part).symlink_to(stored / part)
+
+
 def camera_yaml(odometry: Path, size: tuple[int, int]) -> str:
     P = read_calibration(odometry / "calib.txt").projection("image_2")
     names = {"fx": P[0, 0], "fy": P[1, 1], "cx": P[0, 2], "cy": P[1, 2]}

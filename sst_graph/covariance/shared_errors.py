@@ -30,7 +30,7 @@ class SharedErrors:
     @property
     def estimated(self) -> int:
         """Half-samples that have an estimate."""
-        return int(np.isfinite(self.samples).all(axis=1).sum())
+        return int(with_estimate(self.samples).sum())
 
     def cross_covariance(self, other: SharedErrors) -> FloatArray:
         """(7, 7) covariance with another camera's estimate."""
@@ -38,6 +38,11 @@ class SharedErrors:
         for name in self.common.keys() & other.common.keys():
             cross += np.outer(self.common[name], other.common[name])
         return cross
+
+
+def with_estimate(steps: FloatArray) -> NDArray[np.bool_]:
+    """(k,) which half-samples have an estimate, from their steps (k, n)."""
+    return np.asarray(np.isfinite(steps).all(axis=1))
 
 
 def spread_covariance(steps: FloatArray, others: FloatArray | None = None) -> FloatArray:
@@ -51,7 +56,7 @@ def spread_covariance(steps: FloatArray, others: FloatArray | None = None) -> Fl
         others: (k, n) steps of another camera's estimate by the same half-samples: the covariance of the two.
     """
     others = steps if others is None else others
-    known = np.isfinite(steps).all(axis=1) & np.isfinite(others).all(axis=1)
+    known = with_estimate(steps) & with_estimate(others)
     k, size = int(known.sum()), steps.shape[1]
     if k < FEWEST:
         return np.zeros((size, size))

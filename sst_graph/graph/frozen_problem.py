@@ -96,13 +96,6 @@ class NormalEquations:
         followed = self.g_twists + self.H_mixed @ x
         return x, -(inverse @ followed[:, :, None])[:, :, 0]
 
-    def step_without(self, fixed: IntArray) -> FloatArray:
-        """(n,) the step of all unknowns but the twists that leaves some where they are."""
-        _, H, g = self._reduced(0.0)
-        x, rest = np.zeros(len(g)), np.setdiff1d(np.arange(len(g)), fixed)
-        x[rest] = -np.linalg.solve(H[np.ix_(rest, rest)], g[rest])
-        return x
-
     def covariance(self) -> FloatArray:
         """(n, n) of all unknowns but the twists."""
         return information_inverse(self._reduced(0.0)[1])
@@ -254,11 +247,6 @@ class FrozenProblem:
         self._frames = [self._frames_of(own, places) for own in matches]
         scalars = [float(values.atVector(key)[0]) for key in self._keys]
         self.start = FrozenPoint(state.cTl, np.array(scalars), self._images.twists)
-
-    @property
-    def parameter_columns(self) -> dict[str, int]:
-        """Columns of the parameters of assumptions in the normal equations, by name."""
-        return dict(zip(self._names, self._terms, strict=True))
 
     @property
     def ordering(self) -> gtsam.Ordering:

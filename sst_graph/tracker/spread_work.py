@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Generic, TypeVar
+from abc import ABC, abstractmethod
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -53,3 +54,35 @@ class Run(Generic[_T]):
         if isinstance(self._answer, Exception):
             raise self._answer
         return self._answer
+
+
+class SpreadWork(ABC, Generic[_T]):
+    """A computation that may be stored between two frames: what is stored is how much work was requested, and
+    where it is read back the same steps are done again.
+
+    Attributes:
+        work: requested so far.
+    """
+
+    def __init__(self) -> None:
+        self.work = 0
+        self._run: Run[_T] | None = None
+
+    @abstractmethod
+    def steps(self) -> Stepwise[_T]:
+        """The computation from its beginning."""
+
+    def advance(self, work: int | None) -> _T | None:
+        """Do more work (None: all that is left); the result, once it is complete.
+
+        Raises:
+            EstimationError: there is none; or another of :data:`NUMERICAL_ERRORS`.
+        """
+        if self._run is None:
+            self._run = Run(self.steps())
+        self.work += work or 0
+        return self._run.until(None if work is None else self.work)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the running computation, which follows from the work."""
+        return {**vars(self), "_run": None}

@@ -72,14 +72,7 @@ class Uncertainty:
         positions = np.array([held[name] for name in POSITIONS if name in held]).reshape(-1, 7)
         share = np.array([-held[name] for name in SHIFTS if name in held]).reshape(-1, 7).T
         joint = EstimateCovariance(matrix, smoother.past.point.tracks, m)
-        return cls(
-            joint,
-            inflation,
-            by_static_objects,
-            steps,
-            positions,
-            share,
-        )
+        return cls(joint, inflation, by_static_objects, steps, positions, share)
 
     @property
     def covariance(self) -> FloatArray:

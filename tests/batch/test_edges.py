@@ -9,6 +9,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from layouts import without_label_files
 from stored import simulated
 
 from sst_graph import CalibrationConfig, calibrate, open_source
@@ -133,11 +134,7 @@ def test_real_drives_without_label_files(
     name: str, shift: int, deg: float, metres: float, seconds: float, tmp_path: Path
 ) -> None:
     """Only clouds, pictures, stamps and intrinsics are there."""
-    stored = DATA / f"kitti_2011_09_26_{name}" / "sequences" / "00"
-    bare = tmp_path / "sequences" / "00"
-    bare.mkdir(parents=True)
-    for part in ("velodyne", "image_2", "times.txt", "calib.txt"):
-        (bare / part).symlink_to(stored / part)
+    without_label_files(DATA / f"kitti_2011_09_26_{name}", tmp_path)
     drive = open_source(tmp_path, image_shift=shift)
     assert drive.truth is not None
     start = drive.truth.cTl.retract(np.array([*np.radians([3.0, -4.0, 2.5]), 0.06, -0.08, 0.05]))

@@ -11,6 +11,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from layouts import without_label_files
 from stored import simulated
 from streets import TRACKED_STREET
 
@@ -238,7 +239,7 @@ def test_a_checkpoint_before_the_start_goes_on_alike(tmp_path: Path) -> None:
 
 
 def test_a_checkpoint_with_a_review_under_way(tmp_path: Path) -> None:
-    """What had been done of it is done again: both are at the same step."""
+    """The tracker that is read back does the work of it again: both are at the same step."""
     tracker = begun("edges", 0)
     edges, smoother = tracker.estimate.edges, tracker.estimate.smoother
     assert edges is not None and smoother is not None
@@ -278,11 +279,7 @@ def test_a_real_drive_without_label_files(
     name: str, statuses: set[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Only clouds, pictures, stamps and intrinsics are there; method auto. The last line is the file."""
-    stored = DATA / f"kitti_2011_09_26_{name}" / "sequences" / "00"
-    bare = tmp_path / "sequences" / "00"
-    bare.mkdir(parents=True)
-    for part in ("velodyne", "image_2", "times.txt", "calib.txt"):
-        (bare / part).symlink_to(stored / part)
+    without_label_files(DATA / f"kitti_2011_09_26_{name}", tmp_path)
     truth = open_source(tmp_path, image_shift=1).truth
     assert truth is not None and truth.time_offset_s is not None
     away = np.array([*np.radians([3.0, -4.0, 2.5]), 0.06, -0.08, 0.05])

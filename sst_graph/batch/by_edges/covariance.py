@@ -32,7 +32,7 @@ from sst_graph.batch.by_edges.positions import considered_positions
 from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX, solution_steps
 from sst_graph.batch.problem import JointEstimate
 from sst_graph.covariance.considered import AssumptionConfig, considered_by_matches
-from sst_graph.covariance.shared_errors import FEWEST, SharedErrors, spread_covariance
+from sst_graph.covariance.shared_errors import FEWEST, SharedErrors, spread_covariance, with_estimate
 from sst_graph.errors import EstimationError
 from sst_graph.features.lidar_edges import Edge
 from sst_graph.graph.outer_loop import JointProblem
@@ -153,8 +153,7 @@ def few_edges(steps: FloatArray, outlines: FloatArray | None) -> tuple[str, ...]
         steps: of the half-samples.
         outlines: step without upper edges that may be no outline, or None.
     """
-    known = int(np.isfinite(steps).all(axis=1).sum())
-    doubts = {FEW_OBJECTS: known < FEWEST, FEW_OUTLINES: outlines is None}
+    doubts = {FEW_OBJECTS: with_estimate(steps).sum() < FEWEST, FEW_OUTLINES: outlines is None}
     return tuple(reason for reason, holds in doubts.items() if holds)
 
 

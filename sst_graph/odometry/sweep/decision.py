@@ -178,7 +178,7 @@ def decide_sweep(
     timing = SweepTiming(0.0, -np.pi, period_s, stamp)
     if max(pair.speed_ratio for pair in pairs) < 1.0:
         return SweepDecision("standstill", timing, speed_mps=max(pair.speed_mps for pair in pairs))
-    both = tuple(replace(timing, fraction=f) for f in FRACTIONS.values() if f)
+    both = _both_senses(timing)
     decision = SweepDecision("undecided", timing, others=both)
     windows: list[Window] = []
     used: list[int] = []
@@ -203,6 +203,11 @@ def decide_sweep(
         if expected < _MIN_EXPECTED * -np.log(_ERROR_RATE):
             break
     return decision
+
+
+def _both_senses(timing: SweepTiming) -> tuple[SweepTiming, ...]:
+    """The timing as measured in either sense."""
+    return tuple(replace(timing, fraction=fraction) for fraction in FRACTIONS.values() if fraction)
 
 
 def _pair_motions(scan_at: Callable[[int], Scan | None], count: int) -> list[_PairMotion]:
@@ -242,7 +247,7 @@ def _decide(windows: Sequence[Window], timing: SweepTiming) -> SweepDecision:
         fraction, sector = _best_start(windows[0].thinned(_FEW_SCANS, _FEW_POINTS))
     found = estimate(windows, fraction, sector)
     if not any(window.has_matches for window in windows):
-        others = tuple(replace(timing, fraction=f) for f in FRACTIONS.values() if f)
+        others = _both_senses(timing)
         return SweepDecision("undecided", timing, speed_mps=speed, others=others)
     return replace(_compare_hypotheses(windows, found, timing), speed_mps=speed)
 

@@ -48,10 +48,7 @@ class EdgeReview:
 
 
 def review_steps(
-    problem: JointProblem,
-    state: State,
-    objects: Mapping[ObjectId, int],
-    seed: int,
+    problem: JointProblem, state: State, objects: Mapping[ObjectId, int], seed: int
 ) -> Stepwise[EdgeReview]:
     """The review of an estimate, step by step.
 
@@ -73,9 +70,7 @@ def review_steps(
     outlines = yield from outline_steps(problem, state)
     farther = np.outer(step, step) + (0.0 if outlines is None else np.outer(outlines, outlines))
     reasons = (*contrast_reasons(contrast), *wider_kernel_reasons(step), *few_edges(halves, outlines))
-    known = np.isfinite(halves).all(axis=1).any()
-    spread = spread_covariance(halves) if known else np.zeros((7, 7))
-    return EdgeReview(reasons, spread, np.asarray(farther))
+    return EdgeReview(reasons, spread_covariance(halves), np.asarray(farther))
 
 
 def softness(review: EdgeReview, covariance: FloatArray) -> float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
 
 import gtsam
 import numpy as np
@@ -16,17 +15,16 @@ from sst_graph.batch.by_edges.reasons import far_reasons
 from sst_graph.graph.building import Tracks
 from sst_graph.graph.outer_loop import JointProblem
 from sst_graph.graph.state import State
+from sst_graph.stepwise import Stepwise
 from sst_graph.tracker.by_edges.kinds import of_kind
 from sst_graph.tracker.by_edges.review import EdgeReview, review_steps
 from sst_graph.tracker.config import TrackerConfig
-from sst_graph.tracker.spread_work import NUMERICAL_ERRORS, Run
+from sst_graph.tracker.spread_work import NUMERICAL_ERRORS, SpreadWork
+from sst_graph.tracker.start.first_estimate import FirstEstimate, Stretch
 from sst_graph.tracker.uncertainty import Uncertainty
 from sst_graph.tracker.window.matcher import WindowMatcher
 from sst_graph.tracker.window.smoother import WindowSmoother
 from sst_graph.types import SemanticClass
-
-if TYPE_CHECKING:
-    from sst_graph.tracker.start.first_estimate import FirstEstimate, Stretch
 
 FloatArray = NDArray[np.float64]
 
@@ -40,42 +38,26 @@ _UNGUESSED = np.array([*[10.0] * 3, *[0.3] * 3, 1.0])
 """(7,) deviations of the priors of a review where nothing else is known [rad, m, s]."""
 
 
-class Review:
+class Review(SpreadWork[EdgeReview]):
     """A review that is under way.
 
     Attributes:
         stretch: the scans, as they were when it began.
         state: the estimate then.
         known: what is known beside the edges.
-        work: requested so far.
     """
 
     def __init__(
         self, stretch: Stretch, state: State, known: KnownCalibration, config: TrackerConfig
     ) -> None:
+        super().__init__()
         self.stretch, self.state, self.known, self.config = stretch, state, known, config
-        self.work = 0
-        self._run: Run[EdgeReview] | None = None
 
-    def advance(self, work: int | None) -> EdgeReview | None:
-        """Do more work (None: all that is left); what it has found, once it is complete.
-
-        Raises:
-            EstimationError: too few matches; or another of :data:`NUMERICAL_ERRORS`.
-        """
-        if self._run is None:
-            # A review that was stored is done again as far as it had come: the steps are the same.
-            drive, calibration = of_kind(self.stretch.drive, edges=True), self.config.calibration
-            tracks = Tracks([drive]).with_objects(self.stretch.tracks, self.stretch.dynamic)
-            problem = JointProblem([drive], tracks, calibration.joint, self.known.state, self.known.factor())
-            steps = review_steps(problem, self.state, self.stretch.tracks, calibration.seed)
-            self._run = Run(steps)
-        self.work += work or 0
-        return self._run.until(None if work is None else self.work)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """All but the running computation, which follows from the work."""
-        return {**vars(self), "_run": None}
+    def steps(self) -> Stepwise[EdgeReview]:
+        drive, calibration = of_kind(self.stretch.drive, edges=True), self.config.calibration
+        tracks = Tracks([drive]).with_objects(self.stretch.tracks, self.stretch.dynamic)
+        problem = JointProblem([drive], tracks, calibration.joint, self.known.state, self.known.factor())
+        return review_steps(problem, self.state, self.stretch.tracks, calibration.seed)
 
 
 class EdgeReviews:
@@ -145,8 +127,6 @@ class EdgeReviews:
         return self.reasons if counts else ()
 
     def _new(self, matcher: WindowMatcher, smoother: WindowSmoother) -> Review:
-        from sst_graph.tracker.start.first_estimate import Stretch
-
         window, state = matcher.window, smoother.point.state(matcher.classes)
         drive, numbers = window.latest(len(window.scans))
         known = self.known or KnownCalibration(state, np.diag(_UNGUESSED**2))

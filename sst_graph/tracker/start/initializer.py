@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
 
 from sst_graph.batch.lower_edges import LowerEdgeSupport
+from sst_graph.stepwise import Stepwise
 from sst_graph.tracker.by_edges.kinds import by_edges
 from sst_graph.tracker.by_edges.review import softness
 from sst_graph.tracker.config import TrackerConfig
-from sst_graph.tracker.spread_work import NUMERICAL_ERRORS, Run
+from sst_graph.tracker.spread_work import NUMERICAL_ERRORS, SpreadWork
 from sst_graph.tracker.start.first_estimate import FirstEstimate, Guess, Stretch
 from sst_graph.tracker.start.solution import prior_gaussian
 from sst_graph.tracker.start.steps import start_steps
@@ -82,36 +82,21 @@ class Initialization:
         return softness(self.first.review, self.uncertainty.covariance)
 
 
-class Search:
+class Search(SpreadWork[FirstEstimate]):
     """A batch solution of some scans that is being computed.
 
     Attributes:
         stretch: the scans and images that it is made of, as they were when it began.
         numbers: of the scans.
         guess: where it begins.
-        work: work requested so far.
     """
 
     def __init__(self, stretch: Stretch, numbers: Sequence[int], guess: Guess, config: TrackerConfig) -> None:
+        super().__init__()
         self.stretch, self.numbers, self.guess, self.config = stretch, tuple(numbers), guess, config
-        self.work = 0
-        self._run: Run[FirstEstimate] | None = None
 
-    def advance(self, work: int | None) -> FirstEstimate | None:
-        """Do more work (None: all that is left); the estimate, once it is complete.
-
-        Raises:
-            EstimationError: none was found; or another of :data:`NUMERICAL_ERRORS`.
-        """
-        if self._run is None:
-            # A search that was stored is done again as far as it had come: the steps are the same.
-            self._run = Run(start_steps(self.stretch, self.guess, self.config))
-        self.work += work or 0
-        return self._run.until(None if work is None else self.work)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """All but the running computation, which follows from the work."""
-        return {**vars(self), "_run": None}
+    def steps(self) -> Stepwise[FirstEstimate]:
+        return start_steps(self.stretch, self.guess, self.config)
 
 
 class InitialGraph:
