@@ -83,6 +83,7 @@ def run_on_dask(
                 done = distributed.wait(
                     list(running), timeout=_PATIENCE_S, return_when="FIRST_COMPLETED"
                 ).done
+                outcomes = {future: _outcome(future) for future in done}
             except (TimeoutError, distributed.TimeoutError):
                 yield None
                 continue
@@ -91,25 +92,37 @@ def run_on_dask(
                     f"--dask {cluster.address}: lost the scheduler with {len(running)} drives at it; "
                     "the same command goes on from here, on this one or another"
                 ) from None
-            for future in done:
-                job, error = running.pop(future), future.exception()
-                is_lost = isinstance(error, distributed.KilledWorker)
+            for future, found in outcomes.items():
+                job = running.pop(future)
+                is_lost = isinstance(found, distributed.KilledWorker)
                 if is_lost and rounds[job.drive.name] + 1 < _MOST_ROUNDS:
                     submit(job)
                 elif is_lost and rounds[job.drive.name] < _MOST_ROUNDS:
                     alone.append(job)
                 else:
                     del rounds[job.drive.name]
-                    yield _record(future, job, error, is_lost)
+                    yield found if isinstance(found, Record) else _failure(job, found, is_lost)
                 future.release()
 
 
-def _record(future: Any, job: Job, error: BaseException | None, is_lost: bool) -> Record:
-    """What a task gave, or why it gave nothing: its workers were lost, or one could not run it."""
-    if error is None:
+def _outcome(future: Any) -> Record | BaseException:
+    """What a task gave, or its error: a result can still be lost, with the worker that holds it.
+
+    Raises:
+        CancelledError: the scheduler is lost.
+    """
+    try:
         record = future.result()
-        assert isinstance(record, Record)
-        return record
+    except CancelledError:
+        raise
+    except Exception as error:
+        return error
+    assert isinstance(record, Record)
+    return record
+
+
+def _failure(job: Job, error: BaseException, is_lost: bool) -> Record:
+    """Why a task gave nothing: its workers were lost, or one could not run it."""
     words = " ".join(str(error).split()) or type(error).__name__
     name, place = job.drive.name, job.drive.place.url
     if is_lost:

@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -72,6 +73,28 @@ def test_dask_repeats_what_a_lost_worker_had(tmp_path: Path) -> None:
     assert found["drive_0005"].status == "killed" and "Dask workers were lost" in found["drive_0005"].reason
     assert len((tmp_path / "drive_0004").read_text()) >= 4
     assert len((tmp_path / "drive_0005").read_text()) <= 6
+
+
+def dying(job: Job) -> Record:
+    """Kills its worker soon after the drive is done, for the first two times with each drive."""
+    mark = Path(job.folder) / job.drive.name
+    with mark.open("a") as stream:
+        stream.write("x")
+    if mark.stat().st_size <= 2:
+        threading.Timer(0.001, os.kill, (os.getpid(), signal.SIGKILL)).start()
+    return instant(job)
+
+
+@pytest.mark.slow
+def test_a_result_that_is_lost_with_its_worker_is_made_again(tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    import dask
+
+    with dask.config.set({"distributed.scheduler.allowed-failures": 1}):
+        found = [one for one in run_on_dask(jobs(12, tmp_path), Cluster("local", 2), dying) if one]
+    assert sorted(one.drive for one in found) == [job.drive.name for job in jobs(12)]
+    assert {one.status for one in found} <= {"ok", "killed"}
+    assert sum(one.status == "ok" for one in found) >= 6
 
 
 @pytest.mark.slow
