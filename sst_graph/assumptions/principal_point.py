@@ -27,6 +27,7 @@ CX = Assumption(
     span=30.0,
     violation="the pictures lie beside the principal point cx",
     remedy=_REMEDY,
+    prevalence=0.1,  # pictures are cropped, and matrices taken from another day or camera, about that often
     by_edges=True,
 )
 CY = Assumption(
@@ -38,5 +39,6 @@ CY = Assumption(
     span=30.0,
     violation="the pictures lie beside the principal point cy",
     remedy=_REMEDY,
+    prevalence=0.1,  # pictures are cropped, and matrices taken from another day or camera, about that often
     by_edges=True,
 )

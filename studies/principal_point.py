@@ -1,0 +1,59 @@
+"""A principal point that is off, under several prevalences: status, errors in sigmas, NEES. Prints a table.
+
+    OMP_NUM_THREADS=1 python -m studies.principal_point own-547 own-551 third-901 third-903 STOP PARKED
+
+The prevalence is the probability beforehand that the camera matrix's principal point is wrong
+(:mod:`sst_graph.covariance.broken_assumptions`). Drives are those of :mod:`studies.edges_streets`, by labels.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from unittest import mock
+
+import gtsam
+import numpy as np
+
+from sst_graph.assumptions import ASSUMPTIONS
+from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drives
+from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.experiments.wrong_drives import with_principal_point
+from studies.edges_streets import row, source_of, start_step
+
+OFF_PX = ((0.0, 0.0), (5.0, 0.0), (0.0, -6.0))
+PREVALENCES = (0.02, 0.1, 0.25)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("names", nargs="+")
+    config = CalibrationConfig(method="joint")
+    print("| drive | cx, cy off by | prevalence | status | worst axis | NEES / 7 | sigmas |")
+    print("|---" * 7 + "|")
+    for name in parser.parse_args().names:
+        source = source_of(name)
+        truth, kept = source.truth, KeptDrive.of(source)
+        assert truth is not None
+        start = truth.cTl.retract(start_step(name))
+        for off in OFF_PX:
+            drives = prepare_drives([with_principal_point(kept, *off)], config)
+            for prevalence in PREVALENCES:
+                believed = {n: replace(ASSUMPTIONS[n], prevalence=prevalence) for n in ("cx", "cy")}
+                with mock.patch.dict(ASSUMPTIONS, believed):
+                    result = calibrate_prepared(drives, start, config)
+                step = gtsam.Pose3.Logmap(truth.cTl.between(result.T_camera_lidar))
+                error = np.append(step, result.time_offset_s - truth.time_offset_s)
+                sigmas = np.sqrt(np.diag(result.covariance))
+                nees = float(error @ np.linalg.solve(result.covariance, error)) / 7.0
+                worst = float(np.abs(error / sigmas).max())
+                print(
+                    f"| {Path(name).name} | {off[0]:g}, {off[1]:g} px | {prevalence:g} | {result.status} "
+                    f"| {worst:.1f} | {nees:.2f} | {row(sigmas)} |",
+                    flush=True,
+                )
+
+
+if __name__ == "__main__":
+    main()
