@@ -17,6 +17,7 @@ from sst_graph.covariance.observability import ObservabilityConfig, weak_directi
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.inspect.frame_information import KEY, FrameInformation, frames_of
 from sst_graph.inspect.gained import Gained, gained_of
+from sst_graph.inspect.pixels import pixel_covariance
 from sst_graph.inspect.planning import Plan, limits_of, plan_recording
 from sst_graph.result import CalibrationResult, Sigmas, WeakDirection
 from sst_graph.types import ByValue
@@ -199,15 +200,9 @@ def camera_sigmas(result: CalibrationResult) -> Sigmas:
 
 
 def pixel_sigma(result: CalibrationResult, range_m: float) -> PixelSigma:
-    """Where a point on the optical axis lands in the image, to one sigma, by the extrinsic's covariance."""
-    cP = np.array([0.0, 0.0, range_m])
-    lP = result.T_camera_lidar.transformTo(cP)
-    R = result.T_camera_lidar.rotation().matrix()
-    x, y, z = lP
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    cP_H_cTl = R @ np.hstack([-cross, np.eye(3)])
-    J = result.camera.uv_H_cP(cP[None])[0] @ cP_H_cTl
-    across, down = np.sqrt(np.diag(J @ result.covariance[:6, :6] @ J.T)).tolist()
+    """How far a point on the optical axis is drawn from where the picture shows it, to one sigma, at rest."""
+    covariance = pixel_covariance(result, np.array([0.0, 0.0, range_m]), np.eye(6, 7))
+    across, down = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
     return PixelSigma(range_m, across, down)
 
 

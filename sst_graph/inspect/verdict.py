@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.fit import CLOSE_PX, FitQuality
+from sst_graph.inspect.pixels import cP_H_cTl, pixel_covariance
 from sst_graph.inspect.reasons import as_sentence, short_reasons
 from sst_graph.result import CalibrationResult
 
@@ -31,7 +31,7 @@ class Misfit:
 
     Attributes:
         depth_m: depth of the point [m].
-        pixels: in the picture [px].
+        pixels: in the picture (:func:`~sst_graph.inspect.pixels.pixel_covariance`) [px].
         cm: across the line of sight [cm].
         driving_pixels: in the picture at :data:`DRIVING_MPS`, where the time offset counts too [px].
     """
@@ -116,17 +116,19 @@ def _known(result: CalibrationResult) -> str:
 
 def _misfit(result: CalibrationResult, depth_m: float) -> Misfit:
     forward = result.T_camera_lidar.rotation().unrotate(np.array([0.0, 0.0, DRIVING_MPS]))
-    with_offset = np.vstack([np.eye(6), np.zeros(6)])  # at rest
-    driving = np.eye(6, 7)
+    resting, driving = np.eye(6, 7), np.eye(6, 7)
     driving[3:, 6] = -forward
     found = []
     for cP in _places(result.camera, depth_m):
-        cP_H_cTl = _cP_H_cTl(result.T_camera_lidar, cP)
-        J = result.camera.uv_H_cP(cP[None])[0] @ cP_H_cTl
-        across = np.eye(3) - np.outer(cP, cP) / float(cP @ cP)
-        rest = with_offset.T @ result.covariance @ with_offset
-        moving = driving @ result.covariance @ driving.T
-        found.append((_worst(J, rest), 100.0 * _worst(across @ cP_H_cTl, rest), _worst(J, moving)))
+        sight = np.eye(3) - np.outer(cP, cP) / float(cP @ cP)
+        across = sight @ cP_H_cTl(result.T_camera_lidar, cP)
+        found.append(
+            (
+                _worst(pixel_covariance(result, cP, resting)),
+                100.0 * _worst(across @ result.covariance[:6, :6] @ across.T),
+                _worst(pixel_covariance(result, cP, driving)),
+            )
+        )
     pixels, cm, driving_pixels = np.max(found, axis=0).tolist()
     return Misfit(depth_m, pixels, cm, driving_pixels)
 
@@ -141,16 +143,9 @@ def _places(camera: PinholeCamera, depth_m: float) -> list[FloatArray]:
     ]
 
 
-def _cP_H_cTl(cTl: gtsam.Pose3, cP: FloatArray) -> FloatArray:
-    """(3, 6) derivative of cP = cTl . lP by the extrinsic."""
-    x, y, z = cTl.transformTo(cP)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(cTl.rotation().matrix() @ np.hstack([-cross, np.eye(3)]))
-
-
-def _worst(J: FloatArray, covariance: FloatArray) -> float:
-    """Largest standard deviation of J x in any direction."""
-    return float(np.sqrt(max(0.0, np.linalg.eigvalsh(J @ covariance @ J.T)[-1])))
+def _worst(covariance: FloatArray) -> float:
+    """Largest standard deviation in any direction."""
+    return float(np.sqrt(max(0.0, np.linalg.eigvalsh(covariance)[-1])))
 
 
 def figure(value: float) -> str:
