@@ -71,13 +71,13 @@ def verdict(result: CalibrationResult) -> str:
 def quality_line(quality: FitQuality) -> str:
     """Shares of close points, as a line for a terminal."""
     by_labels = quality.by_chance is None
-    what, edge = ("labels", "contour") if by_labels else ("edges", "strongest edge nearby")
     others = {"at the start": quality.share_at_start, "at random rotations": quality.by_chance}
     shares = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in others.items() if share is not None)
     return (
         f"{100.0 * quality.share:.0f} % of {quality.points} boundary points within {CLOSE_PX:g} px of the "
-        f"{edge}{f' ({shares})' if shares else ''}; "
-        f"{what} like these allow {100.0 * quality.attainable:.0f} %"
+        f"{'contour' if by_labels else 'strongest edge nearby'}{f' ({shares})' if shares else ''}"
+        # What edges allow falls with the calibration itself: it would not tell one that is wrong.
+        + (f"; labels like these allow {100.0 * quality.attainable:.0f} %" if by_labels else "")
     )
 
 

@@ -108,8 +108,10 @@ def _by_frame(fit: Fit) -> str:
         for frame, value in zip(fit.frames, close, strict=True)
     ]
     known = np.flatnonzero(np.isfinite(close))
-    chart.level(100.0 * fit.quality.attainable, f"what the {'edges' if fit.by_edges else 'labels'} allow")
-    if fit.quality.by_chance is not None:
+    if fit.quality.by_chance is None:
+        chart.level(100.0 * fit.quality.attainable, "what the labels allow")
+    else:
+        chart.level(100.0 * fit.quality.share, "all frames")
         chart.level(100.0 * fit.quality.by_chance, "at random rotations", "b")
     chart.line(known, close[known], "a")
     chart.dots(known, close[known], "a", titles=[titles[k] for k in known], size=3.0)

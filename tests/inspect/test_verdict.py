@@ -135,7 +135,7 @@ def test_quality_in_one_line() -> None:
     assert "start" not in quality_line(FitQuality(3412, 0.842, None, 0.851))
     assert quality_line(FitQuality(16582, 0.38, 0.19, 0.38, 0.209)) == (
         "38 % of 16582 boundary points within 1.5 px of the strongest edge nearby (at the start 19 %, at "
-        "random rotations 21 %); edges like these allow 38 %"
+        "random rotations 21 %)"
     )
 
 
