@@ -245,8 +245,9 @@ def _likelihood(inspection: Inspection) -> str:
         "One unknown is moved by some sigmas, the others follow as the matches let them, and the score of "
         "the edges is taken again: how well LiDAR edges meet those of the pictures. What it loses counts as "
         "a likelihood, widened as a whole to the result's sigma. The dashed curve is the Gaussian of that "
-        "sigma. One top within a sigma of 0 is good. A second top is another calibration that the pictures "
-        "allow. A score that hardly falls (see the captions) leaves the unknown to motion and the start."
+        "sigma. One top within a sigma of 0 is good; not at 0, for the score counts all points alike, the "
+        "estimate does not. A second top is another calibration that the pictures allow. A score that hardly "
+        "falls (see the captions) leaves the unknown to motion and the start."
     )
     hint = by_score if fit.by_edges else by_matches
     return section("likelihood", "Likelihood", paragraph(hint), grid(profile_charts(fit.profiles, result)))
