@@ -36,6 +36,7 @@ class CalibrationConfig(Settings):
         unknown_motion: what the covariance has beside that of the matches where a single scan does not show
             motion; both 0 where the vehicle stood.
         observability: when a direction counts as unobservable.
+        profiles: whether likelihoods along the unknowns are computed, for a report.
     """
 
     method: Method = setting(
