@@ -34,19 +34,23 @@ QUALITY = "fit_quality"
 
 @dataclass(frozen=True)
 class FitQuality:
-    """Shares of the boundary points that lie within :data:`CLOSE_PX` of their contour.
+    """Shares of the boundary points that lie within :data:`CLOSE_PX` of their contour, or of the strongest
+    edge of the picture nearby.
 
     Attributes:
-        points: boundary points in view that have a contour of their class nearby.
+        points: boundary points in view that have a contour of their class, or an edge, nearby.
         share: of them, under the calibration.
         share_at_start: under the calibration that the estimation started from; None without one.
-        attainable: what a perfect calibration would give with labels like these.
+        attainable: what a perfect calibration would give with labels, or edges, like these.
+        by_chance: mean under random rotations away from the calibration, of edges of pictures; None of
+            contours.
     """
 
     points: int
     share: float
     share_at_start: float | None
     attainable: float
+    by_chance: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """As an entry of the diagnostics."""
@@ -58,13 +62,16 @@ class FitQuality:
         entry = diagnostics.get(QUALITY)
         if not isinstance(entry, Mapping):
             return None
-        points, start = entry.get("points"), entry.get("share_at_start")
+        points, optional = entry.get("points"), [entry.get(name) for name in ("share_at_start", "by_chance")]
         share, attainable = (_share(entry.get(name)) for name in ("share", "attainable"))
         if not isinstance(points, int) or isinstance(points, bool) or not 0 < points < 10**12:
             return None
-        if share is None or attainable is None or (start is not None and _share(start) is None):
+        if share is None or attainable is None:
             return None
-        return cls(points, share, _share(start), attainable)
+        if any(value is not None and _share(value) is None for value in optional):
+            return None
+        start, by_chance = map(_share, optional)
+        return cls(points, share, start, attainable, by_chance)
 
 
 def _share(value: Any) -> float | None:
@@ -94,7 +101,7 @@ class MatchedFrame(ByValue):
 
 @dataclass(frozen=True, eq=False)
 class PointResiduals(ByValue):
-    """Boundary points, their contours and their residuals under the calibration.
+    """Boundary points, their contours (or edges of the picture) and their residuals under the calibration.
 
     Attributes:
         frames: (n,) position of each point's frame in :attr:`Fit.frames`.
@@ -104,10 +111,10 @@ class PointResiduals(ByValue):
         lPs: (n, 3) in the LiDAR frame [m].
         base_taus_s: (n,) stamp of the image minus the time of the point [s].
         l_velocities: (n, 3) velocity over ground of the object, LiDAR frame [m/s].
-        pixels, normals: (n, 2) nearest point of the contour [px], and its outward unit normal.
+        pixels, normals: (n, 2) nearest point of the contour, or the edge's [px], and its outward unit normal.
         residuals_px: (n,) signed distance to the contour, the mask bias of the class taken off [px].
         sigmas_px: (n,) its standard deviation by mask and beam step [px].
-        weights: (n,) robust weight, 0 to 1.
+        weights: (n,) robust weight, 0 to 1; of an edge of the picture, times how clear it is.
         J: (n, 7) derivative of the residual by extrinsic and time offset [px/rad, px/m, px/s].
     """
 
@@ -154,17 +161,21 @@ class OuterIteration:
 class Profile(ByValue):
     """Profile likelihood along one unknown: the frozen matches' cost, all other unknowns optimised again.
 
+    By edges of pictures the cost is what their score loses, and the other unknowns follow linearly.
+
     Attributes:
         unknown: its number in the order of the covariance.
         steps: (k,) from the estimate, rising, 0 among them [rad, m or s].
         costs: (k,) beyond the least of them.
         sigma: standard deviation by the curvature of this cost alone.
+        best_score: that the costs are taken off from; None where they are those of matches.
     """
 
     unknown: int
     steps: FloatArray
     costs: FloatArray
     sigma: float
+    best_score: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,3 +195,8 @@ class Fit(ByValue):
     quality: FitQuality
     iterations: tuple[OuterIteration, ...] = ()
     profiles: tuple[Profile, ...] = ()
+
+    @property
+    def by_edges(self) -> bool:
+        """Whether points are compared with edges of pictures, not with contours of labels."""
+        return self.quality.by_chance is not None

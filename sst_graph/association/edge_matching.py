@@ -27,7 +27,7 @@ from sst_graph.factors.motion import CameraTwist, group_poses, moved_points, tra
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.features.lidar_edges import Boundaries, Edge, joined
 from sst_graph.features.mask_contour import ContourFeet, ContourMap, nearest_contours, stretches
-from sst_graph.features.picture_gradients import PictureGradients, nearest_edges
+from sst_graph.features.picture_gradients import EdgePlace, PictureGradients, nearest_edges
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -55,9 +55,10 @@ class MatchConfig(Settings):
     """How boundary points are matched to contours.
 
     Attributes:
-        edge_peaks: where no mask has the class, points are matched to the peak of the picture's edge, not to
-            the centre of mass under the kernel: one step goes as far as many, and the information is that of
-            a match which follows the pose (:func:`~sst_graph.features.picture_gradients.nearest_edges`).
+        edge_place: what points are matched to where no mask has the class
+            (:func:`~sst_graph.features.picture_gradients.nearest_edges`): the centre of mass of the picture's
+            edge under the kernel; its peak, so that one step goes as far as many, and the information is that
+            of a match which follows the pose; or the strongest edge, to measure residuals.
     """
 
     mask_sigma_px: float = setting(
@@ -73,7 +74,7 @@ class MatchConfig(Settings):
         doc="Error that all matches on one side of an object in one image share. Raise it where "
         "outlines are drawn carelessly.",
     )
-    edge_peaks: bool = internal(False)
+    edge_place: EdgePlace = internal("centre")
 
 
 GATE = 3.0
@@ -237,6 +238,7 @@ class EdgeMatches:
         alignment: all of them, for :mod:`factors`.
         bounds: (g + 1,) where each group's begin, and the end.
         seen: (g,) how many of a group's points fall into the image, matched or not.
+        shares: (m,) share of its full weight that each has: less than 1 of faint edges of pictures.
     """
 
     index: IntArray
@@ -244,6 +246,7 @@ class EdgeMatches:
     alignment: Alignment
     bounds: IntArray
     seen: IntArray
+    shares: FloatArray
 
 
 @dataclass(frozen=True)
@@ -358,7 +361,7 @@ def match_edges(
     if any(isinstance(contour, PictureGradients) for contour in paired.contours):
         tips = some.projected(some.points.outward, cTl, time_offset_s, poses)
         ways = tips - (uvs if shift is None else ideal[index])
-        feet, shares = _contours_or_gradients(some, uvs, ways, kernel, config.edge_peaks)
+        feet, shares = _contours_or_gradients(some, uvs, ways, kernel, config.edge_place)
     else:
         maps = [contour for contour in paired.contours if isinstance(contour, ContourMap)]
         feet, shares = nearest_contours(maps, some.spans, uvs), None
@@ -387,8 +390,8 @@ def match_edges(
     sigmas = match_sigmas(length, cosine[on], config)
     sides = sides_of(paired.points.edges[index], outward[on, 0])
     weights = side_weights(owners, sides, sigmas, config)
-    if shares is not None:
-        weights = weights * shares[near][on]
+    shares = np.ones(len(index)) if shares is None else shares[near][on]
+    weights = weights * shares
     bounds = np.searchsorted(index, paired.bounds)
     alignment = Alignment(
         camera=paired.camera,
@@ -403,17 +406,17 @@ def match_edges(
         l_velocities=None if paired.velocities is None else paired.velocities[index],
         stretches=enlarged,
     )
-    return EdgeMatches(index, sides, alignment, bounds, seen)
+    return EdgeMatches(index, sides, alignment, bounds, seen, shares)
 
 
 def _contours_or_gradients(
-    paired: PairedEdges, uvs: FloatArray, ways: FloatArray, kernel: RobustKernel, peaks: bool
+    paired: PairedEdges, uvs: FloatArray, ways: FloatArray, kernel: RobustKernel, place: EdgePlace
 ) -> tuple[ContourFeet, FloatArray]:
     """Contours of masks for the groups that have one, edges of the picture for the others.
 
     Args:
         ways: (n, 2) outward in the image, of any length [px].
-        peaks: as :func:`~sst_graph.features.picture_gradients.nearest_edges` has it.
+        place: as :func:`~sst_graph.features.picture_gradients.nearest_edges` has it.
 
     Returns:
         The contours, and (n,) the share of its full weight that each has.
@@ -443,7 +446,7 @@ def _contours_or_gradients(
             # The window is where the residual is 0.
             bias = biases[index]
             moved = own + bias[:, None] * outward
-            edges = nearest_edges(pictures, spans, moved, outward, kernel.scale, peaks)
+            edges = nearest_edges(pictures, spans, moved, outward, kernel.scale, place)
             found, shares[index] = edges, np.maximum(edges.shares, 1e-3)
             distances[index] = edges.distances - bias
         normals[index], feet[index], valid[index] = found.normals, found.feet, found.valid

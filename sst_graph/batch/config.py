@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from sst_graph.baselines.sst_calib import PaperConfig
-from sst_graph.config import Settings, setting
+from sst_graph.config import Settings, internal, setting
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.covariance.observability import ObservabilityConfig
 from sst_graph.covariance.unknown_motion import UnknownMotionConfig
@@ -36,6 +36,7 @@ class CalibrationConfig(Settings):
         unknown_motion: what the covariance has beside that of the matches where a single scan does not show
             motion; both 0 where the vehicle stood.
         observability: when a direction counts as unobservable.
+        profiles: whether likelihoods along the unknowns are computed, for a report.
     """
 
     method: Method = setting(
@@ -88,6 +89,7 @@ class CalibrationConfig(Settings):
         True,
         doc="Test whether drives, and parts of a drive, contradict one another. Set to false to save time.",
     )
+    profiles: bool = internal(True)
     check_stamps: bool = setting(
         True,
         doc="Report a result as not converged where a sensor's stamps jump. Set to false for sensors "

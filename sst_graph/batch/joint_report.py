@@ -13,7 +13,7 @@ from sst_graph.batch.assumption_tests import estimated_report
 from sst_graph.batch.lower_edges import WithLowerEdges
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.drive.preparation import Drive
-from sst_graph.fit import Fit
+from sst_graph.fit import Fit, Profile
 from sst_graph.graph.outer_loop import JointSolution, agreement, concentration, explained, poor_fit
 from sst_graph.hand_eye.solution import difference
 from sst_graph.initialization.selection import ALTERNATIVE_RATIO, REACH
@@ -21,6 +21,7 @@ from sst_graph.inspect.frame_gains import frame_gains
 from sst_graph.inspect.frame_information import KEY as FRAME_INFORMATION
 from sst_graph.inspect.frame_information import to_document
 from sst_graph.quality.fit_of_solution import FitOfDrives
+from sst_graph.quality.profiles import profiles
 
 FloatArray = NDArray[np.float64]
 
@@ -106,8 +107,12 @@ def fit_of(
         start = replace(last.state, cTl=guess.cTl, time_offsets_s=(guess.time_offset_s,) * clocks)
     different = {id(solution): solution for solution in solutions}.values()
     iterations = [each for solution in different for each in solution.iterations]
+    along: Sequence[Profile] = ()
+    if problem.config.profiles:
+        sigmas, matches = np.sqrt(np.diag(covariance)), sum(map(len, last.matches))
+        along = profiles(last.frozen, last.optimum, sigmas, matches)
     drives = FitOfDrives(problem.drives, problem.tracks, problem.objects, problem.config.joint.graph)
-    return drives.fit(last, np.sqrt(np.diag(covariance)), start, iterations)
+    return drives.fit(last.state, start, iterations, along)
 
 
 def _moving(solution: JointSolution) -> Iterator[str]:

@@ -41,35 +41,43 @@ def agreement_of_points(edges: Sequence[DriveEdges], state: State, blur_px: floa
     Args:
         blur_px: sigma of the blur, across each point's edge alone [px].
     """
-    found = []
-    for own in edges:
-        paired = own.paired(state)
-        if paired is None:
-            continue
-        offset_s = state.time_offset_s(own.number)
-        uvs = paired.projected(paired.points.lPs, state.cTl, offset_s)
-        inside = np.flatnonzero(paired.camera.in_image(uvs))
-        some, uvs = paired.take(inside), uvs[inside]
-        ways = some.projected(some.points.outward, state.cTl, offset_s) - uvs
-        ways /= np.maximum(np.linalg.norm(ways, axis=1), 1e-9)[:, None]
-        uvs = uvs + some.repeated(some.biases_px)[:, None] * ways
-        groups = [
-            (each, span)
-            for each, span in zip(some.contours, some.spans, strict=True)
-            if isinstance(each, PictureGradients)
-        ]
-        ts = np.arange(-2.5 * blur_px, 2.5 * blur_px + 1e-9, max(STEP_PX, blur_px / 4.0))
-        weights = np.exp(-0.5 * (ts / blur_px) ** 2)
-        weights /= weights.sum()
-        strengths = profiles([each for each, _ in groups], [span for _, span in groups], uvs, ways, ts)
-        known = well_inside(uvs[:, 0], uvs[:, 1], paired.camera.width, paired.camera.height)
-        found.append(np.where(known, weights @ strengths, 0.0))
-    return found
+    pairs = [(own.number, paired) for own in edges if (paired := own.paired(state)) is not None]
+    return [_of_paired(paired, state, number, blur_px) for number, paired in pairs]
 
 
 def score(edges: Sequence[DriveEdges], state: State, blur_px: float) -> float:
     """The score of a state: see the module."""
     return float(sum(values.sum() for values in agreement_of_points(edges, state, blur_px)))
+
+
+def score_of_pairs(pairs: Sequence[tuple[int, PairedEdges]], state: State, blur_px: float) -> float:
+    """The score of a state near the one that scans and images were paired at, drive number by drive number.
+
+    It is of the same points everywhere: with other pairs, other moving objects would be left out.
+    """
+    return float(sum(_of_paired(paired, state, number, blur_px).sum() for number, paired in pairs))
+
+
+def _of_paired(paired: PairedEdges, state: State, number: int, blur_px: float) -> FloatArray:
+    """(n,) share of each boundary point in view, of one drive."""
+    offset_s = state.time_offset_s(number)
+    uvs = paired.projected(paired.points.lPs, state.cTl, offset_s)
+    inside = np.flatnonzero(paired.camera.in_image(uvs))
+    some, uvs = paired.take(inside), uvs[inside]
+    ways = some.projected(some.points.outward, state.cTl, offset_s) - uvs
+    ways /= np.maximum(np.linalg.norm(ways, axis=1), 1e-9)[:, None]
+    uvs = uvs + some.repeated(some.biases_px)[:, None] * ways
+    groups = [
+        (each, span)
+        for each, span in zip(some.contours, some.spans, strict=True)
+        if isinstance(each, PictureGradients)
+    ]
+    ts = np.arange(-2.5 * blur_px, 2.5 * blur_px + 1e-9, max(STEP_PX, blur_px / 4.0))
+    weights = np.exp(-0.5 * (ts / blur_px) ** 2)
+    weights /= weights.sum()
+    strengths = profiles([each for each, _ in groups], [span for _, span in groups], uvs, ways, ts)
+    known = well_inside(uvs[:, 0], uvs[:, 1], paired.camera.width, paired.camera.height)
+    return np.where(known, weights @ strengths, 0.0)
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -21,6 +22,10 @@ from sst_graph.files.array_store import ArrayStore, shape_of, storable
 
 FloatArray = NDArray[np.float64]
 FloatMap = NDArray[np.float32]
+
+EdgePlace = Literal["centre", "peak", "strongest"]
+"""What a point is compared with: the centre of mass of the strengths nearby, their peak by a step of Newton's
+method, or the place of the greatest strength."""
 
 DIRECTIONS = 8
 """Directions of which strengths are kept, evenly over half a turn: a ninth of a right angle off, an edge has
@@ -41,6 +46,11 @@ _LEAST_MASS = 0.5
 """Least sum of strengths above the usual, times pixels, that makes an edge."""
 _LEAST_STIFFNESS = 0.3
 """An edge's peak is taken for no farther than the centre of mass over this share."""
+_EDGE_WIDTH_PX, _CENTRE_STEPS = 1.2, 4
+"""Sigma of an edge in the strengths [px], and steps of the mean shift to its centre."""
+_LEAST_STRENGTH = 1.0
+"""Least strength above the usual of an edge that is looked for by its strength: as much again as the mean of
+the surroundings."""
 
 
 @storable("strengths", "usual")
@@ -181,7 +191,7 @@ def nearest_edges(
     uvs: FloatArray,
     outward: FloatArray,
     scale_px: float,
-    peaks: bool = False,
+    place: EdgePlace = "centre",
 ) -> GradientFeet:
     """Edges across the outward directions near pixels uvs (n, 2): their centres of mass under a Gaussian.
 
@@ -196,7 +206,9 @@ def nearest_edges(
     Args:
         outward: (n, 2) unit vectors.
         scale_px: sigma of the Gaussian [px].
-        peaks: the peaks instead of the centres, shares times the stiffness.
+        place: peaks instead of the centres, shares times the stiffness; or where the strength under the
+            Gaussian is greatest: one edge of several, which does not follow the pixel. It tells how far off
+            a pose is.
     """
     n = len(uvs)
     if n == 0:
@@ -208,14 +220,31 @@ def nearest_edges(
     valid = well_inside(uvs[:, 0], uvs[:, 1], width, height)
     safe = np.where(valid[:, None], uvs, 5.0)
     mass = np.maximum(profiles(gradients, spans, safe, outward, ts), 0.0, dtype=np.float64)
-    mass *= np.exp(-0.5 * (ts / scale_px) ** 2)[:, None]
+    window = np.exp(-0.5 * (ts / scale_px) ** 2)
+    mass *= window[:, None]
+    if place == "strongest":
+        centre, strengths = _strongest(mass, ts, window)
+        valid &= strengths > _LEAST_STRENGTH
+        return GradientFeet(-centre, outward, safe + centre[:, None] * outward, valid, strengths / _MOST)
     total, first, second = np.stack([np.ones_like(ts), ts, ts**2]) @ mass
     centre = first / np.maximum(total, 1e-9)
     valid &= total * step > _LEAST_MASS
     shares = np.minimum(total * step / (_MOST * 2.0), 1.0)
-    if peaks:
+    if place == "peak":
         variance = second / np.maximum(total, 1e-9) - centre**2
         stiffness = 1.0 - variance / scale_px**2
         centre = centre / np.maximum(stiffness, _LEAST_STIFFNESS)
         shares = shares * np.maximum(stiffness, 0.0)
     return GradientFeet(-centre, outward, safe + centre[:, None] * outward, valid, shares)
+
+
+def _strongest(mass: FloatArray, ts: FloatArray, window: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(n,) distances of the edges with the greatest mass (m, n) [px], and (n,) their strengths, both without
+    the window (m,): strong edges are bounded, so that it would move them along their flat tops."""
+    best = mass.argmax(axis=0)
+    strengths = mass / window[:, None]
+    place = ts[best]
+    for _ in range(_CENTRE_STEPS):
+        near = strengths * np.exp(-0.5 * ((ts[:, None] - place) / _EDGE_WIDTH_PX) ** 2)
+        place = ts @ near / np.maximum(near.sum(axis=0), 1e-9)
+    return place, strengths[best, np.arange(len(best))]

@@ -70,19 +70,24 @@ def verdict(result: CalibrationResult) -> str:
 
 def quality_line(quality: FitQuality) -> str:
     """Shares of close points, as a line for a terminal."""
-    start = (
-        "" if quality.share_at_start is None else f" (at the start {100.0 * quality.share_at_start:.0f} %)"
-    )
+    by_labels = quality.by_chance is None
+    others = {"at the start": quality.share_at_start, "at random rotations": quality.by_chance}
+    shares = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in others.items() if share is not None)
     return (
         f"{100.0 * quality.share:.0f} % of {quality.points} boundary points within {CLOSE_PX:g} px of the "
-        f"contour{start}; labels like these allow {100.0 * quality.attainable:.0f} %"
+        f"{'contour' if by_labels else 'strongest edge nearby'}{f' ({shares})' if shares else ''}"
+        # What edges allow falls with the calibration itself: it would not tell one that is wrong.
+        + (f"; labels like these allow {100.0 * quality.attainable:.0f} %" if by_labels else "")
     )
 
 
 def fit_line(result: CalibrationResult) -> str:
-    """How well the result fits its data, as a line for a terminal: by labels, else by edges; else empty."""
+    """How well the result fits its data, as a line for a terminal: by labels, or by edges; else empty."""
     quality = FitQuality.from_diagnostics(result.diagnostics)
-    return edges_line(result) if quality is None else quality_line(quality)
+    if quality is None:
+        return edges_line(result)
+    contrast = "" if quality.by_chance is None else edges_line(result)
+    return "; ".join(line for line in (contrast, quality_line(quality)) if line)
 
 
 def edges_line(result: CalibrationResult) -> str:

@@ -1,28 +1,30 @@
-"""The fit of a joint solution: quality, residuals, convergence, profiles."""
+"""The fit of a solution: quality, residuals, convergence, profiles."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.drive.preparation import Drive
-from sst_graph.fit import CLOSE_PX, MOST_POINTS, Fit, FitQuality, OuterIteration
+from sst_graph.fit import CLOSE_PX, MOST_POINTS, Fit, FitQuality, OuterIteration, Profile
 from sst_graph.graph.building import Tracks
-from sst_graph.graph.matching import GraphConfig
-from sst_graph.graph.outer_loop import JointSolution
+from sst_graph.graph.matching import GraphConfig, edges_of
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import ObjectId
 from sst_graph.quality.close_points import attainable_share, close_share
-from sst_graph.quality.profiles import profiles
 from sst_graph.quality.residuals import Measured, measure_points
 
 FloatArray = NDArray[np.float64]
 
+_POINTS_OF_SHARE = 10_000
+"""Most points of a drive whose share is measured under other states."""
+
 
 class FitOfDrives:
-    """Measures how states fit the labels of some drives."""
+    """Measures how states fit the labels of some drives, or edges of their pictures."""
 
     def __init__(
         self,
@@ -31,49 +33,75 @@ class FitOfDrives:
         objects: Sequence[dict[ObjectId, int]],
         config: GraphConfig,
     ) -> None:
-        """objects: tracks of the objects of each drive."""
-        self.drives, self.tracks, self.objects, self.config = drives, tracks, objects, config
+        """
+        Args:
+            objects: tracks of the objects of each drive.
+            config: where no mask has a class, points are compared with the strongest edge nearby: matches
+                of an estimate follow the pose.
+        """
+        self.objects = objects
+        self.edges = edges_of(drives, tracks, replace(config, edge_place="strongest"))
 
     def measured(self, state: State) -> Measured | None:
-        """Boundary points that have a contour nearby; None without any."""
-        return measure_points(self.drives, self.tracks, self.objects, state, self.config)
+        """Boundary points that have a contour or an edge nearby; None without any."""
+        return measure_points(self.edges, self.objects, state)
 
-    def quality(self, measured: Measured, start: State | None) -> FitQuality:
-        """Shares of the points, the same ones under the start."""
+    def quality(self, measured: Measured, start: State | None, others: Sequence[State] = ()) -> FitQuality:
+        """Shares of the points under the calibration and under others.
+
+        With contours, those are shares of the same points: one that has no contour nearby is not close. Edges
+        of pictures are chosen at each state, and the share is of the points that have one there: any choice
+        at the calibration would favour it.
+
+        Args:
+            start: where the estimation started, or None.
+            others: states for comparison, with edges of pictures.
+        """
         points = measured.points
+        chance = [self.share(other) for other in others]
+        at_start = None
+        if start is not None:
+            at_start = self.share(start) if others else self._share_at(start, measured)
         return FitQuality(
             len(points),
             close_share(points.residuals_px),
-            None if start is None else self._share_at(start, measured),
+            at_start,
             attainable_share(points.residuals_px, points.J[:, :3], points.frames, measured.side_numbers),
+            float(np.mean(chance)) if chance else None,
         )
+
+    def share(self, state: State) -> float:
+        """Share of close points under a state, of some of each drive's points."""
+        some = [own.thinned(_POINTS_OF_SHARE) for own in self.edges]
+        there = measure_points(some, self.objects, state)
+        return 0.0 if there is None else close_share(there.points.residuals_px)
 
     def fit(
         self,
-        solution: JointSolution,
-        sigmas: FloatArray,
+        state: State,
         start: State | None,
         iterations: Sequence[OuterIteration],
+        profiles: Sequence[Profile],
+        others: Sequence[State] = (),
     ) -> Fit | None:
-        """Of a solution; None where no boundary point has a contour.
+        """Of a state; None where no boundary point has a contour or an edge.
 
         Args:
-            sigmas: (7,) of the result [rad, m, s].
-            start: where the estimation started, if it did with a guess.
-            iterations: how the solution was reached.
+            start, others: as :meth:`quality` has them.
+            iterations: how the state was reached.
+            profiles: along the unknowns.
         """
-        measured = self.measured(solution.state)
+        measured = self.measured(state)
         if measured is None:
             return None
-        quality, points = self.quality(measured, start), measured.points
+        quality, points = self.quality(measured, start, others), measured.points
         every = -(-len(points) // MOST_POINTS)
-        matches = sum(map(len, solution.matches))
         return Fit(
             measured.frames,
             points.take(slice(None, None, every)),
             quality,
             tuple(iterations),
-            profiles(solution.frozen, solution.optimum, sigmas, matches),
+            tuple(profiles),
         )
 
     def _share_at(self, state: State, measured: Measured) -> float:

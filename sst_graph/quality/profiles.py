@@ -1,12 +1,21 @@
-"""Profile likelihood along each unknown, on frozen matches."""
+"""Profile likelihood along each unknown: on frozen matches, and by the score of edges of pictures."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.association.edge_matching import PairedEdges
+from sst_graph.edges.agreement import score_of_pairs
+from sst_graph.factors.motion import CameraTwist
 from sst_graph.fit import Profile
 from sst_graph.graph.frozen_problem import FrozenPoint, FrozenProblem
+from sst_graph.graph.matching import DriveEdges
+from sst_graph.graph.state import State
 
 FloatArray = NDArray[np.float64]
 
@@ -14,6 +23,14 @@ _STEPS = (1.0, 2.0, 3.0, 4.0)
 """How far a profile goes to either side, in standard deviations."""
 _FEW_STEPS = (2.0, 4.0)
 """The same of large problems, so that profiles take a few seconds at most."""
+_SCORE_STEPS = (0.5, 1.0, 2.0, 3.0)
+"""How far a profile by the score goes to either side, in standard deviations."""
+_SCORE_BLUR_PX = 1.5
+"""Blur of that score [px]: that under which solutions are compared."""
+_SCORE_POINTS = 60_000
+"""Most points of a drive in that score."""
+_BESIDE_PX = 50.0
+"""Points farther than this beside the picture do not come into it by a profile's steps [px]."""
 _LARGE = 20_000
 """Matches from which on a problem is large."""
 REACH: FloatArray = np.array([np.radians(1.0)] * 3 + [0.5] * 3 + [0.1])
@@ -49,3 +66,59 @@ def profiles(
         rising = np.array(costs)[order] - min(costs)
         found.append(Profile(unknown, np.array(steps)[order], rising, float(curvature[unknown])))
     return tuple(found)
+
+
+def score_profiles(
+    edges: Sequence[DriveEdges], state: State, covariance: FloatArray, sigmas: FloatArray
+) -> tuple[Profile, ...]:
+    """What the score of edges of pictures loses along the seven unknowns.
+
+    Scan and image are paired as at the estimate, so that the score is of the same points at every step.
+
+    Args:
+        state: the estimate.
+        covariance: (7, 7) of the frozen problem, by which the other unknowns follow: they would be optimised
+            again if matches were frozen.
+        sigmas: (7,) of the result, in which steps are counted [rad, m, s].
+    """
+    some = [own.thinned(_SCORE_POINTS) for own in edges]
+    pairs = [
+        (own.number, _near_view(paired, state.cTl, state.time_offset_s(own.number)))
+        for own in some
+        if (paired := own.paired(state)) is not None
+    ]
+
+    def score(step: FloatArray) -> float:
+        moved = state.cTl.retract(step[:6])
+        clocks = tuple(offset_s + float(step[6]) for offset_s in state.time_offsets_s)
+        turned = moved.compose(state.cTl.inverse()).AdjointMap()
+        there = [(number, _with_motion_in(turned, paired)) for number, paired in pairs]
+        return score_of_pairs(there, replace(state, cTl=moved, time_offsets_s=clocks), _SCORE_BLUR_PX)
+
+    middle = score(np.zeros(7))
+    found = []
+    for unknown in range(7):
+        unit = min(float(sigmas[unknown]), float(REACH[unknown]) / _SCORE_STEPS[-1])
+        way = covariance[:, unknown] / covariance[unknown, unknown]
+        steps = unit * np.array(_SCORE_STEPS)
+        steps = np.concatenate([-steps[::-1], [0.0], steps])
+        scores = np.array([middle if step == 0.0 else score(step * way) for step in steps])
+        costs = scores.max() - scores
+        # The Gaussian's cost, step^2 / (2 sigma^2), that is nearest to the costs.
+        sigma = np.sqrt((steps**4).sum() / max(2.0 * float(steps**2 @ costs), 1e-300))
+        found.append(Profile(unknown, steps, costs, float(sigma), float(scores.max())))
+    return tuple(found)
+
+
+def _with_motion_in(other: FloatArray, paired: PairedEdges) -> PairedEdges:
+    """The pairs with the motion of another camera on the vehicle; other: (6, 6) adjoint map to its frame."""
+    motions = [CameraTwist(other @ each.c_twist, other @ each.c_acceleration) for each in paired.motions]
+    return replace(paired, motions=motions)
+
+
+def _near_view(paired: PairedEdges, cTl: gtsam.Pose3, time_offset_s: float) -> PairedEdges:
+    """The points that are in the picture, or may come into it."""
+    camera, uvs = paired.camera, paired.projected(paired.points.lPs, cTl, time_offset_s)
+    size = np.array([camera.width, camera.height])
+    near = ((uvs > -_BESIDE_PX) & (uvs < size + _BESIDE_PX)).all(axis=1)
+    return paired.take(np.flatnonzero(near))

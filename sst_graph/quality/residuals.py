@@ -9,12 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.association.edge_matching import SIDES
-from sst_graph.drive.preparation import Drive
 from sst_graph.factors import residuals
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.fit import MatchedFrame, PointResiduals
-from sst_graph.graph.building import Tracks
-from sst_graph.graph.matching import DriveMatches, GraphConfig, edges_of, match_all
+from sst_graph.graph.matching import DriveEdges, DriveMatches, match_all
 from sst_graph.graph.outer_loop import KERNELS_PX
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import ObjectId
@@ -48,18 +46,14 @@ class Measured:
 
 
 def measure_points(
-    drives: Sequence[Drive],
-    tracks: Tracks,
-    objects: Sequence[dict[ObjectId, int]],
-    state: State,
-    config: GraphConfig,
+    edges: Sequence[DriveEdges], objects: Sequence[dict[ObjectId, int]], state: State
 ) -> Measured | None:
-    """All boundary points in view that have a contour nearby; None without any.
+    """All boundary points in view that have a contour, or an edge of the picture, nearby; None without any.
 
     Args:
         objects: tracks of the objects of each drive.
     """
-    found = match_all(edges_of(drives, tracks, config), state, RobustKernel("geman_mcclure", WIDE_PX))
+    found = match_all(edges, state, RobustKernel("geman_mcclure", WIDE_PX))
     if not found:
         return None
     frames: list[MatchedFrame] = []
@@ -113,6 +107,6 @@ def _points(
         alignment.normals,
         r,
         alignment.sigmas_px,
-        RobustKernel("geman_mcclure", KERNELS_PX[-1]).weight(r / alignment.sigmas_px),
+        own.found.shares * RobustKernel("geman_mcclure", KERNELS_PX[-1]).weight(r / alignment.sigmas_px),
         J[:, :7],
     )

@@ -105,9 +105,9 @@ class Chart:
                 f'x2="{a:.1f}" y2="{b:.1f}"/><circle class="dot a" cx="{u:.1f}" cy="{v:.1f}" r="2"/></g>'
             )
 
-    def level(self, y: float, name: str = "") -> None:
+    def level(self, y: float, name: str = "", colour: str = "muted") -> None:
         """A horizontal line."""
-        self.line(self.x, (y, y), "muted", name, dashed=True)
+        self.line(self.x, (y, y), colour, name, dashed=True)
 
     def svg(self) -> str:
         """The chart."""

@@ -1,8 +1,9 @@
-"""Close-ups of single objects: points, contour, and how far the calibration's uncertainty moves them."""
+"""Close-ups of single objects: points, contour or edges of the picture, and how far the calibration's
+uncertainty moves them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -25,17 +26,27 @@ IntArray = NDArray[np.intp]
 COUNT = 10
 """Close-ups of a report."""
 _WORST = 3
-"""How many of them are those whose labels agree least."""
+"""How many of them are those whose labels, or edges, agree least."""
 _PARTS = 3
 """Parts of the record in each of which an object may be shown."""
-_LEAST_POINTS = 12
-"""Fewest boundary points of an object that is shown."""
+_APART_PX = 120.0
+"""Close-ups of one part of the record lie farther apart than this [px]: tracks of objects break."""
+_LEAST_POINTS, _LEAST_SHOWN = 12, 3
+"""Fewest boundary points of an object that is shown, and of its part in the close-up."""
 ZOOM = 8
 """Enlargement: of an object that is larger, the part that determines most is shown."""
 _WIDTH, _HEIGHT = 416, 312
 """Size of a close-up [px of the page]."""
+_SIZE_PX = np.array([_WIDTH, _HEIGHT]) // ZOOM
+"""What it shows of the picture [px]."""
 _MARGIN_PX = 4.0
 """Picture around the points that are shown [px]."""
+_DARK_AND_BRIGHT = 1.0, 99.0
+"""Percentiles of the grey levels that become black, and :data:`_WHITE`."""
+_WHITE, _MOST_GAIN = 230.0, 3.0
+"""Grey level of what is bright, and most that contrast is raised: more would show noise."""
+_EDGE_PX = 0.8
+"""Half the length at which an edge of the picture is drawn [px]."""
 _SIDE_NAMES = ("left", "right", "top", "bottom")
 
 
@@ -46,7 +57,7 @@ class Detection:
     Attributes:
         points: positions of its boundary points.
         share: of the information that the whole drive gives, on average over the unknowns.
-        worst: whether it is shown because its labels agree least.
+        worst: whether it is shown because its labels, or edges, agree least.
     """
 
     points: IntArray
@@ -55,7 +66,8 @@ class Detection:
 
 
 def telling_detections(points: PointResiduals, covariance: FloatArray) -> list[Detection]:
-    """Objects that determine most, then those that agree least; with few of them, the same in other frames.
+    """Objects of which what is shown determines most, then those that agree least; with few of them, the same
+    in other frames.
 
     Args:
         covariance: (7, 7) of the result.
@@ -63,26 +75,48 @@ def telling_detections(points: PointResiduals, covariance: FloatArray) -> list[D
     leverages = _leverages(points, covariance)
     total = max(float(leverages.sum()), 1e-12)
     frames = 1 + int(points.frames.max(initial=0))
-    best: dict[tuple[int, int], Detection] = {}
+    best: dict[tuple[int, int], tuple[float, Detection]] = {}
     for own in _by_detection(points):
-        found = Detection(own, float(leverages[own].sum()) / total)
+        shown = own[_shown(points.pixels[own], leverages[own])]
+        if len(own) < _LEAST_POINTS or len(shown) < _LEAST_SHOWN:
+            continue
         track, frame = int(points.tracks[own[0]]), int(points.frames[own[0]])
-        key = track, frame * _PARTS // frames
-        if len(own) >= _LEAST_POINTS and (key not in best or found.share > best[key].share):
-            best[key] = found
+        key, found = (track, frame * _PARTS // frames), float(leverages[shown].sum())
+        if key not in best or found > best[key][0]:
+            best[key] = found, Detection(own, float(leverages[own].sum()) / total)
     seen: set[int] = set()
     firsts: list[Detection] = []
     again: list[Detection] = []
-    for (track, _), found in sorted(best.items(), key=lambda item: -item[1].share):
-        (again if track in seen else firsts).append(found)
+    for (track, _), (_, detection) in sorted(best.items(), key=lambda item: -item[1][0]):
+        (again if track in seen else firsts).append(detection)
         seen.add(track)
-    ranked = [*firsts, *again]
+    parts = points.frames * _PARTS // frames
+    ranked = _apart([*firsts, *again], points, parts)
     strong, others = ranked[: COUNT - _WORST], ranked[COUNT - _WORST :]
+    least = sorted(others, key=lambda one: -_misfit_px(points.take(one.points)))[:_WORST]
+    return [*strong, *(Detection(one.points, one.share, True) for one in least)]
 
-    def misfit(one: Detection) -> float:
-        return -float(np.median(np.abs(points.residuals_px[one.points])))
 
-    return [*strong, *(Detection(one.points, one.share, True) for one in sorted(others, key=misfit)[:_WORST])]
+def _apart(ranked: Sequence[Detection], points: PointResiduals, parts: IntArray) -> list[Detection]:
+    """Detections that are not beside a better one in the same part (n,) of the record, which come last."""
+    places = [points.pixels[one.points].mean(axis=0) for one in ranked]
+    first: list[int] = []
+    for k, one in enumerate(ranked):
+        near = (
+            float(np.linalg.norm(places[k] - places[other])) < _APART_PX
+            and parts[one.points[0]] == parts[ranked[other].points[0]]
+            for other in first
+        )
+        if not any(near):
+            first.append(k)
+    return [ranked[k] for k in first] + [one for k, one in enumerate(ranked) if k not in first]
+
+
+def _misfit_px(points: PointResiduals) -> float:
+    """How far an object is off [px]: single edges of pictures often are, the mean of an object's is not."""
+    if _has_contours(points):
+        return float(np.median(np.abs(points.residuals_px)))
+    return abs(_mean(points, np.ones(len(points), np.bool_)))
 
 
 def close_ups(
@@ -132,22 +166,23 @@ def _close_up(
     size = float(np.median(np.abs(r)))
     reach = float(np.median(np.linalg.norm(moves, axis=1)))
     range_m = float(np.median(np.linalg.norm(points.lPs, axis=1)))
-    why = "labels agree least" if detection.worst else "determines most"
-    title = f"{class_name} at {range_m:.0f} m, {why}"
+    by_edges = not _has_contours(points)
+    worst = "edges agree least" if by_edges else "labels agree least"
+    title = f"{class_name} at {range_m:.0f} m, {worst if detection.worst else 'determines most'}"
     sides = ", ".join(
-        f"{_SIDE_NAMES[side]} {np.mean(r[points.sides == side]):+.1f} px" for side in np.unique(points.sides)
+        f"{_SIDE_NAMES[side]} {_mean(points, points.sides == side):+.1f} px"
+        for side in np.unique(points.sides)
     )
     column, row = (0.5 * np.array([crop.left + crop.right, crop.top + crop.bottom])).astype(int)
     caption = (
-        f"{size:.1f} px from the contour (median of {len(r)} points; {sides}), "
+        f"{size:.1f} px from the {'edges' if by_edges else 'contour'} (median of {len(r)} points; {sides}), "
         f"{100.0 * np.mean(np.abs(r) < CLOSE_PX):.0f} % within {CLOSE_PX:g} px. ±2 sigma of the calibration "
         f"moves it by ±{reach:.1f} px. {100.0 * detection.share:.1f} % of the information. "
         f"{drawn.frame.drive}, image {drawn.frame.image}, about column {column}, row {row}."
     )
     width, height = picture.shape[1], picture.shape[0]
-    marks = [
-        f'<path class="contour" d="{_contour_path(drawn, SemanticClass(int(points.classes[0])), crop)}"/>'
-    ]
+    lines = _picture_edges(points, crop) if by_edges else _contour_path(drawn, points, crop)
+    marks = [f'<path class="contour" d="{lines}"/>']
     for (u, v), (du, dv), (x, y), value in zip(
         crop.places(uvs), ZOOM * moves, crop.places(points.pixels), r, strict=True
     ):
@@ -164,6 +199,16 @@ def _close_up(
         + "".join(marks)
         + f"</svg><figcaption>{text(caption)}</figcaption></figure>"
     )
+
+
+def _has_contours(points: PointResiduals) -> bool:
+    """Whether an object is compared with a contour; else with edges of the picture, point by point."""
+    return int(points.classes[0]) != SemanticClass.OBJECT
+
+
+def _mean(points: PointResiduals, chosen: NDArray[np.bool_]) -> float:
+    """Mean residual of some points, those that are far off weighed down [px]."""
+    return float(np.average(points.residuals_px[chosen], weights=points.weights[chosen] + 1e-9))
 
 
 def _two_sigma_moves(
@@ -189,6 +234,13 @@ def _two_sigma_moves(
     return np.asarray(2.0 * A @ (root @ directions[:, -1]))
 
 
+def _shown(uvs: FloatArray, importance: FloatArray) -> NDArray[np.bool_]:
+    """(n,) which of points (n, 2) are in the close-up: all, or where they are more than it holds, those
+    around one of them that are most important (n,)."""
+    near = np.asarray((np.abs(uvs[:, None] - uvs[None]) <= 0.5 * _SIZE_PX - _MARGIN_PX).all(axis=2))
+    return np.asarray(near[int(np.argmax(near @ importance))])
+
+
 @dataclass(frozen=True)
 class _Crop:
     """A part of a picture, enlarged.
@@ -206,9 +258,7 @@ class _Crop:
     def around(cls, uvs: FloatArray, importance: FloatArray, pixels: NDArray[np.uint8]) -> _Crop:
         """Points (n, 2) with what is around them, in the size of a close-up; the most important (n,) where
         they are more than that."""
-        size = np.array([_WIDTH, _HEIGHT]) // ZOOM
-        near = np.asarray((np.abs(uvs[:, None] - uvs[None]) <= 0.5 * size - _MARGIN_PX).all(axis=2))
-        shown = uvs[near[int(np.argmax(near @ importance))]]
+        size, shown = _SIZE_PX, uvs[_shown(uvs, importance)]
         last = np.maximum(np.array(pixels.shape[1::-1]) - size, 0)
         middle = 0.5 * (np.nanmin(shown, axis=0) + np.nanmax(shown, axis=0))
         left, top = np.clip(np.round(middle - 0.5 * size).astype(int), 0, last).tolist()
@@ -216,16 +266,28 @@ class _Crop:
         return cls(left, top, right, bottom)
 
     def enlarged(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The part, as bright as a picture can be."""
         part = pixels[self.top : self.bottom, self.left : self.right]
-        return np.asarray(cv2.resize(part, None, fx=ZOOM, fy=ZOOM, interpolation=cv2.INTER_CUBIC), np.uint8)
+        low, high = np.percentile(part, _DARK_AND_BRIGHT).tolist()
+        gain = min(_WHITE / max(high - low, 1.0), _MOST_GAIN)
+        fine = cv2.resize(part, None, fx=ZOOM, fy=ZOOM, interpolation=cv2.INTER_CUBIC).astype(np.float64)
+        return np.asarray(np.clip(gain * (fine - low), 0.0, 255.0), np.uint8)
 
     def places(self, uvs: FloatArray) -> FloatArray:
         """(n, 2) where pixels lie in the close-up."""
         return np.asarray(ZOOM * (uvs + 0.5 - [self.left, self.top]))
 
 
-def _contour_path(drawn: DrawnFrame, semantic_class: SemanticClass, crop: _Crop) -> str:
-    """The contour within the crop, below a pixel, as the path of an SVG."""
+def _picture_edges(points: PointResiduals, crop: _Crop) -> str:
+    """The picture's edge that each point is compared with, as the path of an SVG."""
+    along = _EDGE_PX * np.stack([-points.normals[:, 1], points.normals[:, 0]], axis=1)
+    ends = zip(crop.places(points.pixels - along), crop.places(points.pixels + along), strict=True)
+    return "".join(f"M{a:.1f} {b:.1f}L{c:.1f} {d:.1f}" for (a, b), (c, d) in ends)
+
+
+def _contour_path(drawn: DrawnFrame, points: PointResiduals, crop: _Crop) -> str:
+    """The contour of the object's class within the crop, below a pixel, as the path of an SVG."""
+    semantic_class = SemanticClass(int(points.classes[0]))
     contour = ContourMap.of(drawn.image.mask, semantic_class, drawn.image.pixels, valid=drawn.image.valid)
     if contour is None:
         return ""

@@ -43,14 +43,18 @@ class Placements:
     after: Calibration
 
 
-def overlay(drawn: DrawnFrame, placements: Placements, points: PointResiduals | None) -> str:
+def overlay(
+    drawn: DrawnFrame, placements: Placements, points: PointResiduals | None, edge_name: str = "contour"
+) -> str:
     """A picture with the cloud of one frame, for the page's script.
 
     Args:
         points: the frame's boundary points, where residuals are known.
+        edge_name: what they are compared with.
     """
     picture, scale = _fitted(drawn.image.pixels)
     columns = _cloud(drawn, placements)
+    of_cloud = np.unique(columns[3])
     if points is not None and len(points):
         columns = [
             np.concatenate(pair) for pair in zip(columns, _boundary(drawn, placements, points), strict=True)
@@ -67,9 +71,8 @@ def overlay(drawn: DrawnFrame, placements: Placements, points: PointResiduals | 
         "residualBefore": packed(_steps(before_px)),
         "residual": packed(_steps(after_px)),
         "contours": _contours(drawn, classes_of(points), scale),
-        "classes": {
-            str(int(c)): _NAMES[c] for c in sorted(SemanticClass(int(c)) for c in np.unique(classes))
-        },
+        "classes": {str(int(c)): _NAMES[c] for c in sorted(SemanticClass(int(c)) for c in of_cloud)},
+        "edge": edge_name,
     }
     frame = drawn.frame
     alt = f"Image {frame.image} of {frame.drive} with the LiDAR's points of scan {frame.scan} drawn over it"

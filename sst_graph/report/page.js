@@ -107,7 +107,7 @@ for (const root of document.querySelectorAll(".overlay")) {
   bar.append(...(names.length > 1 ? [modes] : []), ...(data.contours.length ? [label] : []));
   function drawKey() {
     const entries = mode === "class" ? Object.entries(data.classes).map(([c, name]) => [hues[c] || "#9aa0a6", name])
-      : mode === "residual" ? [["#39e06f", "within 1.5 px of the contour"], ["#ffc233", "1.5 to 4 px"], ["#ff4b4b", "farther"]]
+      : mode === "residual" ? [["#39e06f", `within 1.5 px of the ${data.edge}`], ["#ffc233", "1.5 to 4 px"], ["#ff4b4b", "farther"]]
       : [["linear-gradient(90deg," + [300, 800, 2000, 6000].map(depthColour).join(",") + ")", "3 m to 60 m deep"]];
     key.replaceChildren(...entries.map(([colour, name]) => {
       const entry = document.createElement("span"), swatch = document.createElement("i");

@@ -41,6 +41,22 @@ from sst_graph.report.uncertainty_charts import (
 from sst_graph.result import CalibrationResult
 from sst_graph.types import Calibration, Source
 
+_CONTOURS_HINT = (
+    "The objects that determine the calibration most, then those whose labels agree with it least; of each "
+    f"the part that determines most, {ZOOM} times enlarged. Yellow: contour of the labels, moved to the "
+    f"edges of the picture. Points: where the LiDAR sees the object end, green within {CLOSE_PX:g} px of the "
+    "contour, red beyond; magenta joins each with its contour. Blue bars: how far ±2 sigma of the "
+    "calibration would move the point. Most points should lie on the yellow line."
+)
+_EDGES_HINT = (
+    "The objects that determine the calibration most, then those whose edges agree with it least; of each "
+    f"the part that determines most, {ZOOM} times enlarged. Points: where the LiDAR sees the object end, "
+    f"green within {CLOSE_PX:g} px of the picture's strongest edge across it, red beyond. Yellow: that edge; "
+    "magenta joins the two. Blue bars: how far ±2 sigma of the calibration would move the point. Trust your "
+    "eyes more than the colours: points must run along the outline that you see. Some have a stronger edge "
+    "beside them, such as a shadow or a marking, and are red under a right calibration too. A row of points "
+    "beside its outline, to the same side in several pictures, is a wrong one."
+)
 PICTURES = 3
 """Pictures with the cloud, over all drives."""
 
@@ -158,15 +174,17 @@ def _pictures(inputs: ReportInputs, reader: DriveReader) -> str:
     pictures = []
     for one in drawn:
         points = None if fit is None else fit.points.take(_points_of(fit, one.frame))
-        pictures.append(overlay(one, _placements(result, one.frame.drive), points))
+        edge_name = "edge of the picture" if fit is not None and fit.by_edges else "contour"
+        pictures.append(overlay(one, _placements(result, one.frame.drive), points, edge_name))
     hint = (
         "Drag in the picture or move the slider: left of the line the cloud as the start would place it, "
         "right of it as the result does. Edges of vehicles, poles and kerbs must meet their picture."
     )
     if fit is not None:
+        compared_with = "strongest edge nearby" if fit.by_edges else "contour of the labels (yellow)"
         hint += (
             " Coloured by residual, only boundary points are shown: green ones lie within "
-            f"{CLOSE_PX:g} px of the contour of the labels (yellow)."
+            f"{CLOSE_PX:g} px of the {compared_with}."
         )
     return section("pictures", "Before and after", paragraph(hint), *pictures) if pictures else ""
 
@@ -196,13 +214,7 @@ def _close_ups(inputs: ReportInputs, reader: DriveReader) -> str:
     if fit is None:
         return ""
     figures = close_ups(fit, inputs.result, lambda drive: _placements(inputs.result, drive), reader)
-    hint = (
-        "The objects that determine the calibration most, then those whose labels agree with it least; of "
-        f"each the part that determines most, {ZOOM} times enlarged. Yellow: contour of the labels, moved to "
-        f"the edges of the picture. Points: where the LiDAR sees the object end, green within {CLOSE_PX:g} "
-        "px of the contour, red beyond; magenta joins each with its contour. Blue bars: how far ±2 sigma of "
-        "the calibration would move the point. Most points should lie on the yellow line."
-    )
+    hint = _EDGES_HINT if fit.by_edges else _CONTOURS_HINT
     return section("objects", "Telling objects", paragraph(hint), grid(figures, "large")) if figures else ""
 
 
@@ -213,7 +225,7 @@ def _residuals(result: CalibrationResult) -> str:
     return section(
         "residuals",
         "Residuals",
-        grid([*residual_charts(fit, result.camera), convergence_chart(fit.iterations, result)]),
+        grid([*residual_charts(fit, result.camera), convergence_chart(fit, result)]),
     )
 
 
@@ -222,13 +234,22 @@ def _likelihood(inspection: Inspection) -> str:
     fit = result.fit
     if fit is None or not fit.profiles:
         return ""
-    hint = (
+    by_matches = (
         "Profile likelihood: one unknown is moved by some sigmas, all others are optimised again on the "
         "matches of the result. The dashed curve is the Gaussian of the result's sigma. The profile is "
         "widened as a whole to the result's sigma, for errors of neighbouring matches are "
         "correlated. A profile that "
         "leans or has a shoulder is a sigma that holds to one side only."
     )
+    by_score = (
+        "One unknown is moved by some sigmas, the others follow as the matches let them, and the score of "
+        "the edges is taken again: how well LiDAR edges meet those of the pictures. What it loses counts as "
+        "a likelihood, widened as a whole to the result's sigma. The dashed curve is the Gaussian of that "
+        "sigma. One top within a sigma of 0 is good; not at 0, for the score counts all points alike, the "
+        "estimate does not. A second top is another calibration that the pictures allow. A score that hardly "
+        "falls (see the captions) leaves the unknown to motion and the start."
+    )
+    hint = by_score if fit.by_edges else by_matches
     return section("likelihood", "Likelihood", paragraph(hint), grid(profile_charts(fit.profiles, result)))
 
 

@@ -20,7 +20,9 @@ _LEAST_POINTS = 15
 _BINS = 12
 _CELLS = 9, 4
 """Cells of the vector field across and down the picture."""
-_LEAST_IN_CELL = 12
+_LEAST_IN_CELL, _LEAST_IN_CELL_BY_EDGES = 12, 40
+"""Fewest points of a cell that is drawn: where their strongest edge is often another one, a few tell nothing.
+"""
 _RIDGE = 0.05
 """Share of a cell's points whose contours must run in another direction for a shift along them to count."""
 _MOST_PX = 6.0
@@ -31,10 +33,10 @@ def residual_charts(fit: Fit, camera: PinholeCamera) -> list[str]:
     """All of them, as figures."""
     points = fit.points
     return [
-        _histogram(points),
+        _histogram(fit),
         _by_frame(fit),
-        _by_object(points),
-        _over_picture(points, camera),
+        _by_object(fit),
+        _over_picture(fit, camera),
         _binned(points, np.linalg.norm(points.lPs, axis=1), "range [m]", "Over the range", _RANGE),
         _binned(
             points,
@@ -48,7 +50,7 @@ def residual_charts(fit: Fit, camera: PinholeCamera) -> list[str]:
 
 _RANGE = (
     "Median and middle half of the residuals. A trend towards near points is an error of the translation; "
-    "one at all ranges alike is one of the rotation or of the masks."
+    "one at all ranges alike is one of the rotation (or of masks)."
 )
 _AZIMUTH = (
     "Median and middle half of the residuals. Steps or slopes that are wider than the band speak of a wrong "
@@ -56,14 +58,15 @@ _AZIMUTH = (
 )
 
 
-def _histogram(points: PointResiduals) -> str:
+def _histogram(fit: Fit) -> str:
+    points = fit.points
     edges = np.arange(-_MOST_PX, _MOST_PX + 0.25, 0.5)
     counts, _ = np.histogram(points.residuals_px, edges)
     shares = 100.0 * counts / max(1, len(points))
     chart = Chart(
         (-_MOST_PX, _MOST_PX),
         (0.0, 1.1 * float(shares.max())),
-        ("distance to the contour [px], outside is positive", "points [%]"),
+        (f"distance to the {_edge_name(fit)} [px], outside is positive", "points [%]"),
         "Histogram of the residuals",
     )
     middles = 0.5 * (edges[1:] + edges[:-1])
@@ -77,6 +80,12 @@ def _histogram(points: PointResiduals) -> str:
     caption = (
         f"One peak about 0, most of it within {CLOSE_PX:g} px (green), is what a right calibration shows."
     )
+    if fit.by_edges:
+        caption = (
+            f"A sharp peak about 0 (green: within {CLOSE_PX:g} px) is what a right calibration shows. It "
+            "stands on points whose strongest edge nearby is another one: those are spread over all "
+            "distances, and under a wrong calibration they are all there is."
+        )
     return figure(chart.svg(), "Residuals of all boundary points", caption)
 
 
@@ -99,18 +108,23 @@ def _by_frame(fit: Fit) -> str:
         for frame, value in zip(fit.frames, close, strict=True)
     ]
     known = np.flatnonzero(np.isfinite(close))
-    chart.level(100.0 * fit.quality.attainable, "what the labels allow")
+    if fit.quality.by_chance is None:
+        chart.level(100.0 * fit.quality.attainable, "what the labels allow")
+    else:
+        chart.level(100.0 * fit.quality.share, "all frames")
+        chart.level(100.0 * fit.quality.by_chance, "at random rotations", "b")
     chart.line(known, close[known], "a")
     chart.dots(known, close[known], "a", titles=[titles[k] for k in known], size=3.0)
     return figure(
         chart.svg(),
         "By frame",
         f"Share of the points within {CLOSE_PX:g} px. A step that stays is a mount that moved or a lost "
-        "image; single dips are frames with poor labels.",
+        f"image; single dips are frames with poor {'pictures' if fit.by_edges else 'labels'}.",
     )
 
 
-def _by_object(points: PointResiduals) -> str:
+def _by_object(fit: Fit) -> str:
+    points = fit.points
     tracks, numbers = np.unique(points.tracks, return_inverse=True)
     groups = [own for own in _groups(numbers.reshape(-1), len(tracks)) if len(own) >= _LEAST_POINTS]
     groups = sorted(groups, key=len, reverse=True)[:_MOST_OBJECTS]
@@ -126,7 +140,10 @@ def _by_object(points: PointResiduals) -> str:
     chart = Chart(
         (-0.5, len(groups) - 0.5),
         (-1.1 * most, 1.1 * most),
-        ("object, from drawn too large to drawn too small", "mean residual [px]"),
+        (
+            "object, by its residual" if fit.by_edges else "object, from drawn too large to drawn too small",
+            "mean residual [px]",
+        ),
         "Mean residual of each object",
     )
     chart.level(0.0)
@@ -134,13 +151,18 @@ def _by_object(points: PointResiduals) -> str:
     return figure(
         chart.svg(),
         "By object",
-        f"The {len(groups)} objects with the most points. Most labels err by less than 1 px; an "
-        "object far out "
-        "is drawn badly, or moves.",
+        f"The {len(groups)} objects with the most points. "
+        + (
+            "Points far off are weighed down. Most err by less than 1 px; an object far out moves, or has a "
+            "strong edge beside its outline."
+            if fit.by_edges
+            else "Most labels err by less than 1 px; an object far out is drawn badly, or moves."
+        ),
     )
 
 
-def _over_picture(points: PointResiduals, camera: PinholeCamera) -> str:
+def _over_picture(fit: Fit, camera: PinholeCamera) -> str:
+    points = fit.points
     columns, rows = _CELLS
     uvs = points.pixels
     cell = (
@@ -151,7 +173,7 @@ def _over_picture(points: PointResiduals, camera: PinholeCamera) -> str:
     numbers = cell[:, 1] * columns + cell[:, 0]
     places, shifts, titles = [], [], []
     for own in _groups(numbers, columns * rows):
-        if len(own) < _LEAST_IN_CELL:
+        if len(own) < (_LEAST_IN_CELL_BY_EDGES if fit.by_edges else _LEAST_IN_CELL):
             continue
         n, w = points.normals[own], points.weights[own]
         H = n.T @ (w[:, None] * n)
@@ -169,7 +191,7 @@ def _over_picture(points: PointResiduals, camera: PinholeCamera) -> str:
         (0.0, camera.width),
         (0.0, camera.height),
         ("column [px]", "row [px]"),
-        "Mean shift of the points against the contours, over the picture",
+        f"Mean shift of the points against the {_edge_name(fit)}, over the picture",
         down=True,
         square=True,
     )
@@ -177,10 +199,9 @@ def _over_picture(points: PointResiduals, camera: PinholeCamera) -> str:
     return figure(
         chart.svg(),
         "Over the picture",
-        f"Where the points lie against the contours, {enlarged:g} times enlarged (longest {longest:.2f} px). "
-        "Short arrows in all directions are good; a common direction, a swirl or a star is a "
-        "calibration or a lens "
-        "that is wrong.",
+        f"Where the points lie against the {_edge_name(fit)}s, {enlarged:g} times enlarged (longest "
+        f"{longest:.2f} px). Short arrows in all directions are good; a common direction, a swirl or a star "
+        "is a calibration or a lens that is wrong.",
     )
 
 
@@ -205,6 +226,11 @@ def _binned(points: PointResiduals, values: FloatArray, label: str, title: str, 
     chart.band(middles, low, high, "a", "middle half")
     chart.line(middles, middle, "a", "median")
     return figure(chart.svg(), title, caption)
+
+
+def _edge_name(fit: Fit) -> str:
+    """What points are compared with."""
+    return "strongest edge" if fit.by_edges else "contour"
 
 
 def _groups(numbers: IntArray, count: int) -> list[IntArray]:

@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.fit import OuterIteration, Profile
+from sst_graph.fit import Fit, Profile
 from sst_graph.inspect.inspection import HUMAN, NAMES, UNITS, Correlation, correlation_matrix
 from sst_graph.report.chart import Chart
 from sst_graph.report.html import figure, table, text
@@ -22,8 +22,9 @@ _SHORT = ("rot x", "rot y", "rot z", "x", "y", "z", "offset")
 _ELLIPSES = 3
 
 
-def convergence_chart(iterations: Sequence[OuterIteration], result: CalibrationResult) -> str:
+def convergence_chart(fit: Fit, result: CalibrationResult) -> str:
     """Distance to the last estimate, iteration by iteration; empty with fewer than two."""
+    iterations = fit.iterations
     if len(iterations) < 2:
         return ""
     last, sigmas = iterations[-1], np.sqrt(np.diag(result.covariance))
@@ -53,7 +54,8 @@ def convergence_chart(iterations: Sequence[OuterIteration], result: CalibrationR
     return figure(
         chart.svg(),
         "Convergence",
-        "Each iteration matches again and solves. The curves should fall below one sigma and stay there.",
+        "Each iteration matches again and solves. The curves should fall below one sigma and stay there."
+        + " The first ones are on a few scans, the last on all." * fit.by_edges,
     )
 
 
@@ -76,11 +78,16 @@ def _profile(profile: Profile, sigma: float) -> str:
     )
     chart.line(scale * x, np.exp(-0.5 * (x / sigma) ** 2), "muted", "Gaussian", dashed=True)
     # Interpolated as a root of the cost, which is a straight line where the profile is a Gaussian.
-    roots = np.interp(x, profile.steps, np.sign(profile.steps) * np.sqrt(tempered))
+    best = profile.steps[int(np.argmin(tempered))]
+    roots = np.interp(x, profile.steps, np.sign(profile.steps - best) * np.sqrt(tempered))
     chart.line(scale * x, np.exp(-(roots**2)), "a", "profile")
     chart.dots(scale * profile.steps, np.exp(-tempered), "a")
     title = NAMES[profile.unknown][0].upper() + NAMES[profile.unknown][1:]
-    return figure(chart.svg(), title, f"One sigma of the result: {scale * sigma:.2g} {unit}.")
+    caption = f"One sigma of the result: {scale * sigma:.2g} {unit}."
+    if profile.best_score is not None:
+        low, high = (100.0 * profile.costs[[0, -1]] / max(profile.best_score, 1e-9)).tolist()
+        caption += f" At the ends the score is {low:.1f} and {high:.1f} % below its best."
+    return figure(chart.svg(), title, caption)
 
 
 def ellipse_charts(result: CalibrationResult, pairs: Sequence[Correlation]) -> list[str]:

@@ -118,7 +118,9 @@ def calibrate_rig_prepared(
     Args:
         guesses: of every camera.
     """
-    config = with_method_of(config, [drive for own in drives.values() for drive in own])
+    config = replace(
+        with_method_of(config, [drive for own in drives.values() for drive in own]), profiles=False
+    )
     # 1. Each camera by itself, on the same LiDAR features, odometry and object tracks.
     problems = _problems(drives, guesses, config, progress)
     cameras = {name: _solved(problem) for name, problem in problems.items()}

@@ -203,7 +203,7 @@ class FrameMatching:
         edges = frozenset(self.classes) - labelled
         both = [
             (labelled, self.kernel, self.config),
-            (edges, narrow, replace(self.config, edge_peaks=True)),
+            (edges, narrow, replace(self.config, edge_place="peak")),
         ]
         return [each for each in both if each[0]]
 

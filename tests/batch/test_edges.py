@@ -15,6 +15,9 @@ from stored import simulated
 from sst_graph import CalibrationConfig, calibrate, open_source
 from sst_graph.batch.by_edges.choice import with_method_for
 from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.fit import FitQuality
+from sst_graph.inspect.report import summary
+from sst_graph.inspect.verdict import quality_line
 from sst_graph.metrics import calibration_errors
 from sst_graph.simulator import SimulationConfig
 from sst_graph.types import CameraImage, Scan, SemanticClass
@@ -74,6 +77,19 @@ def test_a_street_without_labels(result) -> None:  # type: ignore[no-untyped-def
     assert errors.qad_deg < 0.4 and errors.atd_m < 0.06
     assert errors.time_offset_s is not None and abs(errors.time_offset_s) < 0.01
     assert errors.nees is not None and errors.nees.joint < 3.0 * 7
+
+
+@pytest.mark.slow
+def test_its_fit_is_measured(result) -> None:  # type: ignore[no-untyped-def]
+    """What a report draws, and, of it, what stands in calibration.json."""
+    fit = result.fit
+    assert fit is not None and fit.by_edges and len(fit.profiles) == 7
+    assert fit.quality.share > 1.5 * fit.quality.by_chance
+    assert FitQuality.from_diagnostics(result.diagnostics) == fit.quality
+    assert quality_line(fit.quality) in summary(result)
+    # From the start, on some scans, to all: the last iteration is the result.
+    assert fit.iterations[0].kernel_px > fit.iterations[-1].kernel_px
+    assert fit.iterations[-1].cTl.equals(result.T_camera_lidar, 1e-9)
 
 
 @pytest.mark.slow

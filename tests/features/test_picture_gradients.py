@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 import pytest
 
 from sst_graph.features.picture_gradients import (
     DIRECTIONS,
+    EdgePlace,
     PictureGradients,
     direction_numbers,
     nearest_edges,
@@ -44,7 +47,8 @@ def test_the_peak_is_met_at_once(scale_px: float) -> None:
     outward, away = np.array([[1.0, 0.0]]), 0.8 * scale_px
     pixels = np.array([[80.0 + away, 60.0]])
     centre, peak = (
-        nearest_edges([gradients], [(0, 1)], pixels, outward, scale_px, peaks) for peaks in (False, True)
+        nearest_edges([gradients], [(0, 1)], pixels, outward, scale_px, place)
+        for place in get_args(EdgePlace)[:2]
     )
     assert abs(peak.feet[0, 0] - 80.0) < 0.12 * scale_px < 0.3 * away
     assert peak.distances[0] >= centre.distances[0]
@@ -57,6 +61,22 @@ def test_the_peak_is_met_at_once(scale_px: float) -> None:
         for d in (-step, step)
     ]
     assert (near[1] - near[0]) / (2.0 * step) == pytest.approx(stiffness, abs=0.1)
+
+
+@pytest.mark.parametrize("away", [-4.0, -0.7, 0.0, 3.3])
+def test_the_strongest_edge_does_not_follow_the_pixel(away: float) -> None:
+    """A faint edge beside the pixel and a strong one farther off: the strong one is met, wherever the pixel
+    lies, by the whole distance."""
+    picture = step_picture(0.0).astype(float)
+    picture[:, 88:] += 12.0
+    gradients = PictureGradients.of(np.rint(picture).astype(np.uint8))
+    pixels, outward = np.array([[80.0 + away, 60.0]]), np.array([[1.0, 0.0]])
+    found = nearest_edges([gradients], [(0, 1)], pixels, outward, 5.0, "strongest")
+    assert found.valid[0] and 0.25 < found.shares[0] <= 1.0
+    assert found.distances[0] == pytest.approx(away, abs=0.2)
+    assert found.feet[0, 0] == pytest.approx(80.0, abs=0.2)
+    centre = nearest_edges([gradients], [(0, 1)], pixels, outward, 1.2)
+    assert abs(away) < 3.0 or not centre.valid[0] or abs(centre.distances[0]) < 0.8 * abs(away)
 
 
 def test_no_edge_along_its_own_direction_or_on_plain_ground() -> None:

@@ -133,6 +133,10 @@ def test_quality_in_one_line() -> None:
         "these allow 85 %"
     )
     assert "start" not in quality_line(FitQuality(3412, 0.842, None, 0.851))
+    assert quality_line(FitQuality(16582, 0.38, 0.19, 0.38, 0.209)) == (
+        "38 % of 16582 boundary points within 1.5 px of the strongest edge nearby (at the start 19 %, at "
+        "random rotations 21 %)"
+    )
 
 
 def test_without_labels_the_fit_is_how_far_the_edges_stand_out() -> None:
@@ -144,5 +148,8 @@ def test_without_labels_the_fit_is_how_far_the_edges_stand_out() -> None:
     assert fit_line(alone) == line
     other = _result([0.01] * 7, diagnostics={"contrast": contrast | expected | {"other": 100.0}})
     assert fit_line(other) == line + ", 1.20 times that of the best other optimum (1.08 or more expected)"
+    quality = FitQuality(900, 0.4, None, 0.41, 0.2)
+    both = {"contrast": contrast | expected, "fit_quality": quality.to_dict()}
+    assert fit_line(_result([0.01] * 7, diagnostics=both)) == f"{line}; {quality_line(quality)}"
     for stored in (None, {}, contrast, contrast | expected | {"sigmas": "many"}):
         assert fit_line(_result([0.01] * 7, diagnostics={"contrast": stored})) == ""

@@ -65,7 +65,8 @@ def _turned(axis: int, degrees: float) -> State:
 def _fit() -> Fit:
     _, solution = _solved()
     sigmas = np.array([5e-4] * 3 + [0.005] * 3 + [0.001])
-    fit = _of_drives().fit(solution, sigmas, None, solution.iterations)
+    along = profiles(solution.frozen, solution.optimum, sigmas, sum(map(len, solution.matches)))
+    fit = _of_drives().fit(solution.state, None, solution.iterations, along)
     assert fit is not None
     return fit
 
@@ -122,14 +123,22 @@ def test_the_sample_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     assert copy.deepcopy(whole) == whole and hash(whole) == hash(_fit())
     monkeypatch.setattr(fit_of_solution, "MOST_POINTS", 100)
     _, solution = _solved()
-    small = _of_drives().fit(solution, np.full(7, 1e-3), None, ())
+    small = _of_drives().fit(solution.state, None, (), ())
     assert small is not None
     assert len(small.points) <= 100 < len(whole.points) and small.quality == whole.quality
 
 
 def test_quality_is_read_back_and_nonsense_is_not() -> None:
-    quality = FitQuality(120, 0.8, None, 0.85)
-    assert FitQuality.from_diagnostics({"fit_quality": quality.to_dict()}) == quality
-    for wrong in ({"share": 1.2}, {"points": True}, {"attainable": "0.8"}, {"share_at_start": -1.0}):
+    for quality in (FitQuality(120, 0.8, None, 0.85), FitQuality(120, 0.4, 0.1, 0.42, 0.19)):
+        assert FitQuality.from_diagnostics({"fit_quality": quality.to_dict()}) == quality
+    older = {name: value for name, value in quality.to_dict().items() if name != "by_chance"}
+    assert FitQuality.from_diagnostics({"fit_quality": older}) == replace(quality, by_chance=None)
+    for wrong in (
+        {"share": 1.2},
+        {"points": True},
+        {"attainable": "0.8"},
+        {"share_at_start": -1.0},
+        {"by_chance": "0.2"},
+    ):
         assert FitQuality.from_diagnostics({"fit_quality": {**quality.to_dict(), **wrong}}) is None
     assert FitQuality.from_diagnostics({"fit_quality": 3}) is None

@@ -17,6 +17,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from edge_fits import SIGMAS, fit_at, fit_by_edges, result_by_edges, solution_by_edges, street_by_edges
 from stored import stored
 from streets import CROWDED_STREET, crowded_street
 
@@ -25,7 +26,7 @@ from sst_graph.assumptions.focal_length import FOCAL
 from sst_graph.fit import Fit
 from sst_graph.inspect.verdict import verdict
 from sst_graph.report import ReportInputs, report_html
-from sst_graph.report.close_ups import COUNT, telling_detections
+from sst_graph.report.close_ups import COUNT, ZOOM, telling_detections
 from sst_graph.report.drawn_frame import DriveReader
 from sst_graph.report.overlay import project_points
 from sst_graph.result import CalibrationResult
@@ -56,6 +57,14 @@ def _fit() -> Fit:
 @cache
 def _page() -> str:
     return report_html(ReportInputs(_result(), [crowded_street()]))
+
+
+@cache
+def _page_by_edges() -> str:
+    return report_html(ReportInputs(result_by_edges(), [street_by_edges()]))
+
+
+PAGES = {"labels": _page, "edges": _page_by_edges}
 
 
 class _Checker(html.parser.HTMLParser):
@@ -102,8 +111,10 @@ def _checked(page: str) -> _Checker:
     return checker
 
 
-def test_the_page_is_whole_and_in_order() -> None:
-    checker = _checked(_page())
+@pytest.mark.parametrize("by", PAGES)
+def test_the_page_is_whole_and_in_order(by: str) -> None:
+    page = PAGES[by]()
+    checker = _checked(page)
     assert checker.headings == [
         "Verdict",
         "What is weak, and what to record next",
@@ -114,13 +125,14 @@ def test_the_page_is_whole_and_in_order() -> None:
         "Numbers and background",
     ]
     assert checker.without_alt == []
-    assert verdict(_result()) in _page() and len(_page()) < 15e6
+    assert verdict(_result() if by == "labels" else result_by_edges()) in page and len(page) < 15e6
 
 
-def test_nothing_is_loaded_from_elsewhere() -> None:
-    checker = _checked(_page())
+@pytest.mark.parametrize("by", PAGES)
+def test_nothing_is_loaded_from_elsewhere(by: str) -> None:
+    checker = _checked(PAGES[by]())
     assert all(address.startswith("data:") for address in checker.addresses)
-    assert not re.search(r"https?:|@import|url\(|fetch\(|XMLHttp|WebSocket", _page())
+    assert not re.search(r"https?:|@import|url\(|fetch\(|XMLHttp|WebSocket", PAGES[by]())
 
 
 PROBE = (
@@ -134,13 +146,13 @@ PROBE = (
 """Tells the outer page what the report has become."""
 
 
-def _opened(folder: Path, width: int, dark: bool) -> tuple[dict[str, Any], str]:
+def _opened(folder: Path, page: str, width: int, dark: bool) -> tuple[dict[str, Any], str]:
     """What the probe found in a browser, and the browser's log.
 
     The report stands in a frame: a window is 500 px wide at least.
     """
     outer = folder / "outer.html"
-    style, inner = f"width:{width}px;height:900px;border:0", html.escape(_page() + PROBE)
+    style, inner = f"width:{width}px;height:900px;border:0", html.escape(page + PROBE)
     outer.write_text(f'<iframe style="{style}" srcdoc="{inner}"></iframe>', encoding="utf-8")
     command = [str(CHROMIUM), "--headless", "--no-sandbox", "--disable-gpu", "--window-size=1500,1000"]
     command += [f"--user-data-dir={folder}/profile", "--enable-logging=stderr", "--virtual-time-budget=5000"]
@@ -160,10 +172,11 @@ def test_a_browser_is_there_where_it_must_be() -> None:
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium")
+@pytest.mark.parametrize("by", PAGES)
 @pytest.mark.parametrize(("width", "dark"), [(400, False), (400, True), (1400, False), (1400, True)])
-def test_a_browser_runs_the_page_without_an_error(tmp_path: Path, width: int, dark: bool) -> None:
+def test_a_browser_runs_the_page_without_an_error(tmp_path: Path, by: str, width: int, dark: bool) -> None:
     """And its script has made the controls of each picture; nothing is wider than the window."""
-    seen, log = _opened(tmp_path, width, dark)
+    seen, log = _opened(tmp_path, PAGES[by](), width, dark)
     assert [line for line in log.splitlines() if "CONSOLE" in line] == []
     assert seen["window"] == width and seen["wide"] <= width
     assert seen["back"] == ("rgb(20, 23, 27)" if dark else "rgb(255, 255, 255)")
@@ -220,12 +233,15 @@ def test_frames_that_are_gone_are_left_out() -> None:
     assert "Before and after" not in headings and "Residuals" in headings
 
 
-def test_points_are_drawn_where_their_residuals_say() -> None:
+@pytest.mark.parametrize("by", PAGES)
+def test_points_are_drawn_where_their_residuals_say(by: str) -> None:
     """n . (uv - q) + bias is the residual: what is drawn and what was measured are the same projection."""
-    fit, result = _fit(), _result()
+    fit, result, source = _fit(), _result(), crowded_street()
+    if by == "edges":
+        fit, result, source = fit_by_edges(), result_by_edges(), street_by_edges()
     frame = int(np.bincount(fit.points.frames).argmax())
     points = fit.points.take(fit.points.frames == frame)
-    drawn = DriveReader([crowded_street()]).frame(fit.frames[frame])
+    drawn = DriveReader([source]).frame(fit.frames[frame])
     assert drawn is not None
     uvs, depths = project_points(drawn, points, Calibration(result.T_camera_lidar, result.time_offset_s))
     across = ((uvs - points.pixels) * points.normals).sum(axis=1)
@@ -238,9 +254,12 @@ def test_points_are_drawn_where_their_residuals_say() -> None:
     assert ((moved - uvs) * points.normals).sum(axis=1) == pytest.approx(points.J @ step, abs=1e-5)
 
 
-def test_the_telling_objects_are_different_ones_first() -> None:
-    fit = _fit()
-    chosen = telling_detections(fit.points, _result().covariance)
+@pytest.mark.parametrize("by", PAGES)
+def test_the_telling_objects_are_different_ones_first(by: str) -> None:
+    fit, covariance = _fit(), _result().covariance
+    if by == "edges":
+        fit, covariance = fit_by_edges(), np.diag(SIGMAS**2)
+    chosen = telling_detections(fit.points, covariance)
     assert 3 <= len(chosen) <= COUNT
     strong = [one for one in chosen if not one.worst]
     tracks = [int(fit.points.tracks[one.points[0]]) for one in strong]
@@ -257,6 +276,58 @@ def test_close_ups_are_eight_times_enlarged() -> None:
     for picture in re.findall(r'class="closeup".*?</svg>', _page(), re.DOTALL):
         at = np.array(re.findall(r'cx="([-\d.]+)" cy="([-\d.]+)"', picture), np.float64)
         assert ((at >= 0.0) & (at <= [416.0, 312.0])).all(axis=1).sum() >= 5
+
+
+def test_close_ups_without_labels_show_the_edge_that_each_point_is_compared_with() -> None:
+    """Yellow: across the residual, at its end; the residual is as long as its number says, but for the bias
+    that all have."""
+    page = _page_by_edges()
+    figures = re.findall(
+        r'<figure><h3>(object at [^<]*)</h3><svg class="closeup"(.*?)</figure>', page, re.DOTALL
+    )
+    assert len(figures) == COUNT and "label" not in " ".join(title for title, _ in figures)
+    bias_px = abs(float(next(iter(solution_by_edges().state.biases_px.values()))))
+    for _, figure in figures:
+        (edges,) = re.findall(r'class="contour" d="([^"]*)"', figure)
+        ends = _numbers(r"M([-\d.]+) ([-\d.]+)L([-\d.]+) ([-\d.]+)", edges)
+        residuals = _numbers(r'class="residual" d="M([-\d.]+) ([-\d.]+)L([-\d.]+) ([-\d.]+)"', figure)
+        written = _numbers(r"<title>([-+\d.]+) px</title>", figure)[:, 0]
+        assert len(ends) == len(residuals) == len(written) >= 12
+        assert 0.5 * (ends[:, :2] + ends[:, 2:]) == pytest.approx(residuals[:, 2:], abs=0.11)
+        across, along = residuals[:, 2:] - residuals[:, :2], ends[:, 2:] - ends[:, :2]
+        lengths = np.linalg.norm(across, axis=1)
+        assert np.abs((across * along).sum(axis=1)) == pytest.approx(0.0, abs=0.06 * lengths.max() + 3.0)
+        assert lengths / ZOOM == pytest.approx(np.abs(written), abs=bias_px + 0.1)
+        assert re.search(r"±2 sigma of the calibration moves it by ±\d+\.\d px", figure)
+
+
+def test_a_wrong_calibration_is_seen_on_the_page() -> None:
+    """0.3 deg of yaw: the top of its curve is where it is taken back."""
+    fit = fit_at(np.array([0.0, 0.0, np.radians(0.3), 0.0, 0.0, 0.0, 0.0]))
+    page = report_html(ReportInputs(replace(result_by_edges(), fit=fit), [street_by_edges()]))
+    assert _checked(page).headings[3:6] == ["Telling objects", "Residuals", "Likelihood"]
+
+    def tops(page: str) -> list[float]:
+        charts = re.findall(r'aria-label="Likelihood along.*?</svg></svg>', page, re.DOTALL)
+        assert len(charts) == 7
+        found = []
+        for chart in charts:
+            (line,) = re.findall(r'class="line a" points="([^"]*)"', chart)
+            points = _numbers(r"([-\d.]+),([-\d.]+)", line)
+            middle = 0.5 * (points[0, 0] + points[-1, 0])
+            found.append(6.0 * (points[points[:, 1].argmin(), 0] - middle) / np.ptp(points[:, 0]))
+        return found
+
+    right, wrong = tops(_page_by_edges()), tops(page)
+    assert max(map(abs, right)) <= 1.0  # all within one of the three sigmas that are drawn to either side
+    assert -2.5 < wrong[2] < -1.0
+
+
+def _numbers(pattern: str, words: str) -> np.ndarray:
+    """(n, groups) of every match."""
+    found = [[float(one) for one in match.groups()] for match in re.finditer(pattern, words)]
+    assert found
+    return np.array(found)
 
 
 def test_three_ellipses_and_the_meaning_of_each_assumption() -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from sst_graph.batch.by_edges.covariance import edges_covariance
+from sst_graph.batch.by_edges.fit import fit_of_edges
 from sst_graph.batch.by_edges.halves import halves_reasons
 from sst_graph.batch.by_edges.lens import lens_steps
 from sst_graph.batch.by_edges.optimum import RESTARTS, best_optimum_steps, refined_steps, starts_steps
@@ -72,6 +73,9 @@ def edges_method(
     reasons += wider_kernel_reasons(wider_step)
     if config.check_contradictions:
         reasons += halves_reasons(problem.whole, solution.state, covariance)
+    # 6. How it fits the pictures, point by point.
+    first = [one for _, one in candidates[:1]]
+    fit = fit_of_edges(calibration, (*first, solution), covariance)
     return MethodEstimate(
         solution.state.cTl,
         solution.state.time_offsets_s[0],
@@ -83,6 +87,7 @@ def edges_method(
         diagnostics=_diagnostics(solution, contrast, motion)
         | {"spread": {**own.sigmas, "farther_edges": np.abs(wider_step).tolist()}}
         | {"assumptions": dict(own.assumptions), "estimated": dict(own.estimated)},
+        fit=fit,
         by_sweeps=sweeps.covariance,
         sweep_reasons=sweeps.reasons,
         shared=own.shared,

@@ -134,7 +134,7 @@ def _newton_ascent(
 ) -> Stepwise[tuple[State, float]]:
     """A state near the optimum that a start leads to, and its score, by few long steps: each point is matched
     to the peak of its edge, which Newton's method says, until the score gains too little to count."""
-    graph = replace(problem.config.graph, edge_peaks=True)
+    graph = replace(problem.config.graph, edge_place="peak")
     by_peaks = replace(problem, config=replace(problem.config, graph=graph))
     edges = edges_of(problem.drives, problem.tracks, graph)
     state, found_score = start, 0.0

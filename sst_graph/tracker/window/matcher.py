@@ -205,7 +205,7 @@ class WindowMatcher:
         if by_labels(self.classes):
             yield of_kind(part, edges=False), kernel, self.graph
         narrow = replace(kernel, scale=EDGE_KERNEL_SHARE * kernel.scale)
-        yield of_kind(part, edges=True), narrow, replace(self.graph, edge_peaks=True)
+        yield of_kind(part, edges=True), narrow, replace(self.graph, edge_place="peak")
 
     def edges_of(self, chosen: Collection[int]) -> list[DriveEdges]:
         """The boundary points of objects without a class of some scans."""
