@@ -12,7 +12,7 @@ from sst_graph.batch.method_estimate import Guess
 from sst_graph.diagnosis import Finding, Fit, Fitter, likely_causes, mirror, other_camera, preflight
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
-from sst_graph.graph.building import Tracks
+from sst_graph.graph.matching import Tracks
 from sst_graph.graph.outer_loop import (
     NARROW_KERNELS_PX,
     JointProblem,

@@ -12,7 +12,7 @@ from sst_graph.covariance.observability import ObservabilityConfig
 from sst_graph.covariance.unknown_motion import UnknownMotionConfig
 from sst_graph.drive.preparation import PrepareConfig
 from sst_graph.features.lidar_edges import MAX_RANGE_M
-from sst_graph.graph.building import GraphConfig
+from sst_graph.graph.matching import GraphConfig
 from sst_graph.graph.outer_loop import JointConfig
 from sst_graph.initialization.global_search import SearchConfig
 from sst_graph.odometry.lidar import LidarOdometryConfig

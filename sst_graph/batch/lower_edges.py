@@ -15,8 +15,7 @@ from sst_graph.association.edge_matching import BOTTOM
 from sst_graph.batch.config import UseLowerEdges
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.factors.robust import RobustKernel
-from sst_graph.graph.building import Tracks
-from sst_graph.graph.matching import edges_of, match_all
+from sst_graph.graph.matching import Tracks, edges_of, match_all
 from sst_graph.graph.outer_loop import (
     CONCENTRATION_SCALES,
     KERNELS_PX,

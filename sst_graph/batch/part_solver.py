@@ -16,8 +16,7 @@ from sst_graph.covariance.static_objects import static_covariance
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
 from sst_graph.factors.robust import RobustKernel
-from sst_graph.graph.building import Tracks
-from sst_graph.graph.matching import edges_of, match_all
+from sst_graph.graph.matching import Tracks, edges_of, match_all
 from sst_graph.graph.outer_loop import JointProblem, JointSolution, robust_weights, solve_joint
 from sst_graph.graph.state import State
 from sst_graph.hand_eye.solution import difference

@@ -15,7 +15,7 @@ from sst_graph.covariance.cluster_robust import RobustCovariance, robust_covaria
 from sst_graph.covariance.considered import Considered
 from sst_graph.covariance.static_objects import static_covariance
 from sst_graph.drive.preparation import Drive, Progress
-from sst_graph.graph.building import GraphConfig, Tracks
+from sst_graph.graph.matching import GraphConfig, Tracks
 from sst_graph.graph.outer_loop import (
     KERNELS_PX,
     NARROW_KERNELS_PX,

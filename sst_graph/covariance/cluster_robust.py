@@ -27,8 +27,8 @@ from sst_graph.covariance.error_model import ErrorModel, fit_error_model
 from sst_graph.covariance.jackknife import ObjectSpread, composed, steps_without
 from sst_graph.covariance.match_table import MatchTable, match_table
 from sst_graph.covariance.sums import ScoreSums
-from sst_graph.graph.building import PairMatches
 from sst_graph.graph.elimination import Unknowns, marginal_covariance
+from sst_graph.graph.matching import PairMatches
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import ObjectId
 

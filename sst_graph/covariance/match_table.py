@@ -18,8 +18,9 @@ from sst_graph.covariance.jackknife import curvature_ratio
 from sst_graph.covariance.sums import ScoreSums
 from sst_graph.factors.alignment import weighted_residuals
 from sst_graph.factors.robust import RobustKernel
-from sst_graph.graph.building import PairMatches, bias_groups, state_from
+from sst_graph.graph.building import bias_groups, state_from
 from sst_graph.graph.elimination import Unknowns, twist_responses
+from sst_graph.graph.matching import PairMatches
 from sst_graph.graph.state import State, nuisance_key, time_offset_key, twist_key
 from sst_graph.objects.tracks import ObjectId
 from sst_graph.types import SemanticClass

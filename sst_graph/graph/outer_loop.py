@@ -23,10 +23,10 @@ from sst_graph.errors import EstimationError
 from sst_graph.factors import residuals
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.fit import OuterIteration
-from sst_graph.graph.building import GraphConfig, PairMatches, Tracks, joint_graph
+from sst_graph.graph.building import joint_graph
 from sst_graph.graph.convergence import OSCILLATION_SIGMAS, STEP_SIGMAS, step_share
 from sst_graph.graph.frozen_problem import FrozenPoint, FrozenProblem
-from sst_graph.graph.matching import DriveMatches, edges_of, match_all
+from sst_graph.graph.matching import DriveMatches, GraphConfig, PairMatches, Tracks, edges_of, match_all
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.stepwise import Stepwise, run_to_end

@@ -14,7 +14,7 @@ from sst_graph.association.time_pairing import pair_by_time
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.graph.building import Tracks
+from sst_graph.graph.matching import Tracks
 from sst_graph.graph.state import State
 from sst_graph.initialization.global_search import (
     COARSE,

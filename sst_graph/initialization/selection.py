@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
-from sst_graph.graph.building import GraphConfig
-from sst_graph.graph.matching import edges_of
+from sst_graph.graph.matching import GraphConfig, edges_of
 from sst_graph.graph.outer_loop import KERNELS_PX, NARROW_KERNELS_PX, JointSolution, agreement
 from sst_graph.graph.state import State
 from sst_graph.initialization.candidates import StartProblem, candidate_steps, label_score_steps

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from sst_graph.drive.preparation import Drive
 from sst_graph.fit import CLOSE_PX, MOST_POINTS, Fit, FitQuality, OuterIteration
-from sst_graph.graph.building import Tracks
-from sst_graph.graph.matching import GraphConfig
+from sst_graph.graph.matching import GraphConfig, Tracks
 from sst_graph.graph.outer_loop import JointSolution
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import ObjectId

@@ -13,8 +13,7 @@ from sst_graph.drive.preparation import Drive
 from sst_graph.factors import residuals
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.fit import MatchedFrame, PointResiduals
-from sst_graph.graph.building import Tracks
-from sst_graph.graph.matching import DriveMatches, GraphConfig, edges_of, match_all
+from sst_graph.graph.matching import DriveMatches, GraphConfig, Tracks, edges_of, match_all
 from sst_graph.graph.outer_loop import KERNELS_PX
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import ObjectId

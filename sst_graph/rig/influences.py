@@ -21,8 +21,8 @@ from sst_graph.covariance.cluster_robust import RobustCovariance, steps_without_
 from sst_graph.covariance.error_model import by_side_and_frame
 from sst_graph.covariance.jackknife import ObjectSpread, bounded_ratio
 from sst_graph.factors.velocity import transferred
-from sst_graph.graph.building import PairMatches
 from sst_graph.graph.elimination import twist_responses
+from sst_graph.graph.matching import PairMatches
 from sst_graph.graph.outer_loop import JointSolution
 from sst_graph.graph.state import EXTRINSIC, time_offset_key, twist_key
 

@@ -11,7 +11,7 @@ import pytest
 from streets import prepared_street, standing_street
 
 from sst_graph.errors import EstimationError
-from sst_graph.graph.building import Tracks
+from sst_graph.graph.matching import Tracks
 from sst_graph.graph.outer_loop import (
     KERNELS_PX,
     NARROW_KERNELS_PX,

@@ -15,8 +15,9 @@ from sst_graph.covariance.cluster_robust import (
 from sst_graph.covariance.jackknife import ObjectSpread, composed
 from sst_graph.drive.preparation import PrepareConfig, prepare_drive
 from sst_graph.factors import RobustKernel
-from sst_graph.graph.building import GraphConfig, Tracks, associate, joint_graph
+from sst_graph.graph.building import joint_graph
 from sst_graph.graph.linear import unit_scale
+from sst_graph.graph.matching import GraphConfig, Tracks, associate
 from sst_graph.graph.state import EXTRINSIC, State, bias_key, object_bias_key, time_offset_key
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.simulator import SimulationConfig

@@ -20,8 +20,7 @@ from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.edges.search import KnownRotation, SearchRegion, angle_deg
 from sst_graph.errors import EstimationError
-from sst_graph.graph.building import Tracks
-from sst_graph.graph.matching import DriveEdges, edges_of
+from sst_graph.graph.matching import DriveEdges, Tracks, edges_of
 from sst_graph.graph.outer_loop import JointProblem
 from sst_graph.graph.state import State
 from sst_graph.hand_eye.solution import MotionSolution, alternative, solve_motion

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sst_graph.batch.by_edges.covariance import FEW_OBJECTS, FLOOR
 from sst_graph.batch.by_edges.problem import KnownCalibration
 from sst_graph.batch.by_edges.reasons import far_reasons
-from sst_graph.graph.building import Tracks
+from sst_graph.graph.matching import Tracks
 from sst_graph.graph.outer_loop import JointProblem
 from sst_graph.graph.state import State
 from sst_graph.stepwise import Stepwise

@@ -22,7 +22,7 @@ from sst_graph.batch.by_edges.reasons import edge_contrast_steps, edges_reasons
 from sst_graph.batch.method_estimate import Guess as BatchGuess
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.errors import EstimationError
-from sst_graph.graph.building import Tracks
+from sst_graph.graph.matching import Tracks
 from sst_graph.graph.state import State
 from sst_graph.stepwise import Stepwise
 from sst_graph.tracker.by_edges.review import EdgeReview, review_steps

@@ -11,7 +11,7 @@ from sst_graph.association.edge_matching import GATE
 from sst_graph.drive.preparation import Drive, boundary_count
 from sst_graph.factors import alignment_cost
 from sst_graph.factors.robust import RobustKernel
-from sst_graph.graph.building import GraphConfig, PairMatches, Tracks, associate
+from sst_graph.graph.matching import GraphConfig, PairMatches, Tracks, associate
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.types import SemanticClass
 

@@ -18,9 +18,8 @@ from sst_graph.graph.building import (
     LOWER_EDGE_BIAS_SIGMA_PX,
     PRIOR_ROTATION_SIGMA_RAD,
     PRIOR_TRANSLATION_SIGMA_M,
-    GraphConfig,
-    Tracks,
 )
+from sst_graph.graph.matching import GraphConfig, Tracks
 from sst_graph.graph.outer_loop import (
     KERNELS_PX,
     MIN_EXPLAINED,

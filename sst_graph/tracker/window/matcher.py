@@ -13,8 +13,15 @@ from sst_graph.batch.lower_edges import LowerEdgeSupport, lower_edge_support
 from sst_graph.drive.preparation import Drive, boundaries_of, boundary_count
 from sst_graph.drive.trajectory import GrowingTrack
 from sst_graph.factors.robust import RobustKernel
-from sst_graph.graph.building import GraphConfig, PairMatches, Tracks, associate
-from sst_graph.graph.matching import DYNAMIC_REACH_M, DriveEdges, edges_of
+from sst_graph.graph.matching import (
+    DYNAMIC_REACH_M,
+    DriveEdges,
+    GraphConfig,
+    PairMatches,
+    Tracks,
+    associate,
+    edges_of,
+)
 from sst_graph.graph.outer_loop import KERNELS_PX
 from sst_graph.tracker.by_edges.kinds import EDGE_KERNEL_SHARE, by_edges, by_labels, of_kind
 from sst_graph.tracker.config import TrackerConfig
