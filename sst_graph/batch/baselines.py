@@ -10,10 +10,10 @@ from sst_graph.baselines.second_search import search_again
 from sst_graph.baselines.semalign import solve_semalign
 from sst_graph.baselines.sst_calib import NearestSolution, PaperProblem, solve_paper, solve_static
 from sst_graph.batch.config import CalibrationConfig
-from sst_graph.batch.method_estimate import Guess, MethodEstimate
+from sst_graph.batch.method_estimate import MethodEstimate
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import EstimationError
-from sst_graph.types import Calibration
+from sst_graph.types import Calibration, Guess
 
 
 def paper_method(

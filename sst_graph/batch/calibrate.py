@@ -24,7 +24,6 @@ from sst_graph.batch.joint_report import (
     unknown_motion_remarks,
 )
 from sst_graph.batch.method_estimate import (
-    Guess,
     MethodEstimate,
     drive_offsets,
     frames_used,
@@ -44,7 +43,7 @@ from sst_graph.drive.preparation import TRACK_INTERVAL_S, Drive, PrepareConfig, 
 from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.odometry.sweep import with_sweep
 from sst_graph.result import CalibrationResult
-from sst_graph.types import SemanticClass, Source
+from sst_graph.types import Guess, SemanticClass, Source
 from sst_graph.validation import checked_guess
 
 

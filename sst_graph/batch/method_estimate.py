@@ -30,6 +30,7 @@ from sst_graph.graph.outer_loop import JointSolution
 from sst_graph.graph.state import State
 from sst_graph.odometry.sweep import SWEEP_KEY
 from sst_graph.result import CalibrationResult, DriveOffset, FrameId, Status, WeakDirection
+from sst_graph.types import Guess
 
 if TYPE_CHECKING:
     from sst_graph.batch.problem import JointOutcome
@@ -37,14 +38,6 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 PACKAGES = ("sst-graph", "gtsam", "numpy", "scipy", "small_gicp")
-
-
-@dataclass(frozen=True)
-class Guess:
-    """Initial guess: an extrinsic, or None, and a time offset [s]."""
-
-    cTl: gtsam.Pose3 | None
-    time_offset_s: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from sst_graph.errors import EstimationError
 from sst_graph.graph.outer_loop import KERNELS_PX, solve_joint
 from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
 from sst_graph.hand_eye.solution import difference, solve_motion
+from sst_graph.types import Guess
 
 FloatArray = NDArray[np.float64]
 
@@ -90,9 +91,8 @@ def fuse_motion(
     config, state, covariance = problem.config, labels.solution.state, labels.covariance[:7, :7]
     try:
         reach_s = config.search.time_offset_s
-        motion = solve_motion(problem.drives, state.cTl, state.time_offsets_s[0], reach_s, problem.progress)[
-            0
-        ]
+        guess = Guess(state.cTl, state.time_offsets_s[0])
+        motion = solve_motion(problem.drives, guess, reach_s, problem.progress)[0]
     except EstimationError as error:
         return WithMotion(labels, diagnostics={"left_out": str(error)})
     # 2. Do they agree?

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.lower_edges import WithLowerEdges, with_lower_edges
-from sst_graph.batch.method_estimate import Guess
 from sst_graph.covariance.cluster_robust import RobustCovariance, robust_covariance
 from sst_graph.covariance.considered import Considered
 from sst_graph.covariance.static_objects import static_covariance
@@ -28,6 +27,7 @@ from sst_graph.initialization.candidates import StartProblem
 from sst_graph.initialization.selection import Selection, alternatives, select_start_steps
 from sst_graph.objects.tracks import ObjectId, object_tracks
 from sst_graph.stepwise import run_to_end
+from sst_graph.types import Guess
 
 FloatArray = NDArray[np.float64]
 
@@ -111,10 +111,7 @@ class CalibrationProblem:
 
     def _start_problem(self) -> StartProblem:
         """What a start is searched for, without the tracks of objects."""
-        guess = self.guess
-        return StartProblem(
-            self.drives, Tracks(self.drives), self.config.classes, guess.cTl, guess.time_offset_s
-        )
+        return StartProblem(self.drives, Tracks(self.drives), self.config.classes, self.guess)
 
 
 @dataclass(frozen=True)

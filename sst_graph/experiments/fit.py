@@ -14,7 +14,6 @@ import numpy as np
 
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.batch.config import CalibrationConfig
-from sst_graph.batch.method_estimate import Guess
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import Progress
@@ -23,6 +22,7 @@ from sst_graph.graph.outer_loop import NARROW_KERNELS_PX, solve_joint
 from sst_graph.graph.state import State
 from sst_graph.quality.fit_of_solution import FitOfDrives
 from sst_graph.simulator import SimulationConfig, simulate
+from sst_graph.types import Guess
 
 _HEAD = (
     "| label noise | street | points | at the estimate | at the truth | allowed, at the estimate "

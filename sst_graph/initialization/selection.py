@@ -107,13 +107,14 @@ def select_start_steps(
     if not config.enabled:
         start = (Calibration(candidates[0].cTl, candidates[0].time_offset_s),)
         return Selection(start, start, candidates[0].score)
-    candidates = candidates[: _CANDIDATES_WITHOUT_GUESS if problem.guess is None else most_candidates]
+    candidates = candidates[: _CANDIDATES_WITHOUT_GUESS if problem.guess.cTl is None else most_candidates]
     selection = yield from select_among_steps(problem, candidates, graph, config, most_scans)
-    if problem.guess is not None:
+    if problem.guess.cTl is not None:
         return selection
     closer = []
     for cTl, time_offset_s in selection.distant:
-        around = yield from candidate_steps(replace(problem, guess=cTl), config)
+        guess = replace(problem.guess, cTl=cTl)
+        around = yield from candidate_steps(replace(problem, guess=guess), config)
         closer += [Candidate(cTl, time_offset_s, selection.score), *around[:most_candidates]]
     return (yield from select_among_steps(problem, closer, graph, config, most_scans))
 
@@ -135,7 +136,7 @@ def select_among_steps(
     full = RefinementProblem.of(edges_of(few, problem.tracks, graph), graph)
     rough = full.thinned(_WIDE_POINTS)
     yield 10
-    poses = _poses(_with_offsets(candidates, problem.time_offset_s), full.biases)
+    poses = _poses(_with_offsets(candidates, problem.guess.time_offset_s), full.biases)
     centres = _centres(poses, problem)
     for kernels_px in _WIDE_STAGES:
         poses = yield from refine_steps(rough, poses, centres, kernels_px)
@@ -148,7 +149,9 @@ def select_among_steps(
     # 3. The best that stayed within reach, by boundaries and by all labels.
     states = States(poses.rotations, poses.translations, poses.offsets)
     scores = yield from label_score_steps(problem, states, config)
-    scores = equations.agreements * np.sqrt(np.maximum(scores, 0.0)) * _in_reach(poses, problem.guess, config)
+    scores = (
+        equations.agreements * np.sqrt(np.maximum(scores, 0.0)) * _in_reach(poses, problem.guess.cTl, config)
+    )
     order = _different(poses, scores)
     if scores[order[0]] <= 0.0:
         raise EstimationError("no candidate of the search leads to a solution near the guess")
@@ -229,7 +232,7 @@ def _cTls(poses: Poses) -> list[gtsam.Pose3]:
 
 def _centres(poses: Poses, problem: StartProblem) -> Poses:
     """What the weak priors of each pose are centred on, as in :meth:`StartProblem.centre`."""
-    offsets, guess = np.full(len(poses), problem.time_offset_s), problem.guess
+    offsets, guess = np.full(len(poses), problem.guess.time_offset_s), problem.guess.cTl
     if guess is None:
         return Poses(poses.rotations, np.zeros_like(poses.translations), offsets, poses.biases)
     rotations = np.broadcast_to(guess.rotation().matrix(), poses.rotations.shape)

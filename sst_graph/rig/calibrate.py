@@ -21,7 +21,7 @@ from sst_graph.batch.calibrate import (
     solve_problem,
 )
 from sst_graph.batch.config import CalibrationConfig
-from sst_graph.batch.method_estimate import Guess, MethodEstimate
+from sst_graph.batch.method_estimate import MethodEstimate
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.batch.sources import as_sources
 from sst_graph.config import expect_settings, to_dict
@@ -46,7 +46,7 @@ from sst_graph.rig.joint_covariance import JointCovariance, joint_covariance
 from sst_graph.rig.known import KnownRig
 from sst_graph.rig.marginal import RigMarginal
 from sst_graph.rig.result import RigResult, worst
-from sst_graph.types import Source
+from sst_graph.types import Guess, Source
 from sst_graph.validation import checked_guess
 
 FloatArray = NDArray[np.float64]

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from sst_graph.association.time_pairing import pair_by_time
 from sst_graph.batch.by_edges.parts import thinned
 from sst_graph.batch.config import CalibrationConfig
-from sst_graph.batch.method_estimate import Guess
 from sst_graph.batch.motion_factor import gaussian_factor
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.drive.preparation import Drive, Progress
@@ -25,6 +24,7 @@ from sst_graph.graph.outer_loop import JointProblem
 from sst_graph.graph.state import State
 from sst_graph.hand_eye.solution import MotionSolution, alternative, solve_motion
 from sst_graph.sampling import evenly_spread
+from sst_graph.types import Guess
 
 FloatArray = NDArray[np.float64]
 
@@ -107,7 +107,7 @@ def motion_alone(
     """What motion says; None where it says nothing, two things, or what the guess rules out."""
     reach_s = config.search.time_offset_s
     try:
-        solutions = solve_motion(drives, guess.cTl, guess.time_offset_s, reach_s, progress)
+        solutions = solve_motion(drives, guess, reach_s, progress)
     except EstimationError:
         return None
     possible = [

@@ -12,7 +12,7 @@ from sst_graph.tracker.by_edges.kinds import by_edges
 from sst_graph.tracker.by_edges.review import softness
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.spread_work import NUMERICAL_ERRORS, SpreadWork
-from sst_graph.tracker.start.first_estimate import FirstEstimate, Guess, Stretch
+from sst_graph.tracker.start.first_estimate import FirstEstimate, StartGuess, Stretch
 from sst_graph.tracker.start.solution import prior_gaussian
 from sst_graph.tracker.start.steps import start_steps
 from sst_graph.tracker.uncertainty import Uncertainty
@@ -59,7 +59,7 @@ class Restart:
         chi2: statistic that shows it, if any.
     """
 
-    guess: Guess
+    guess: StartGuess
     scans: int
     reason: str
     alarm: bool = False
@@ -91,7 +91,9 @@ class Search(SpreadWork[FirstEstimate]):
         guess: where it begins.
     """
 
-    def __init__(self, stretch: Stretch, numbers: Sequence[int], guess: Guess, config: TrackerConfig) -> None:
+    def __init__(
+        self, stretch: Stretch, numbers: Sequence[int], guess: StartGuess, config: TrackerConfig
+    ) -> None:
         super().__init__()
         self.stretch, self.numbers, self.guess, self.config = stretch, tuple(numbers), guess, config
 
@@ -147,7 +149,7 @@ class Initializer:
         work_per_frame: done with each frame; None: all with one, which takes seconds.
     """
 
-    def __init__(self, guess: Guess, config: TrackerConfig) -> None:
+    def __init__(self, guess: StartGuess, config: TrackerConfig) -> None:
         self.guess, self.config = guess, config
         self.waited = self.attempts = 0
         self.alarmed = False
@@ -156,7 +158,7 @@ class Initializer:
         self.why = ""
         self.work_per_frame: int | None = _WORK_PER_FRAME
 
-    def restart(self, guess: Guess, scans: int, alarmed: bool) -> None:
+    def restart(self, guess: StartGuess, scans: int, alarmed: bool) -> None:
         """From a guess, with some scans that are there already."""
         self.guess, self.waited, self.search, self.graph = guess, scans, None, None
         self.alarmed = self.alarmed or alarmed
@@ -272,7 +274,7 @@ class Initializer:
         self.attempts, self.why = self.attempts + 1, why
         self.search = self.graph = None
         if self.attempts >= _MAX_ATTEMPTS:
-            self.guess = Guess(self.guess.cTl, self.guess.time_offset_s)
+            self.guess = StartGuess(self.guess.cTl, self.guess.time_offset_s)
 
     def succeeded(self) -> None:
         """There is an estimate."""

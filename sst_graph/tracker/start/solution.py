@@ -35,7 +35,7 @@ from sst_graph.initialization.selection import select_start_steps
 from sst_graph.stepwise import Stepwise
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.monitor.adoption import held_out_cost
-from sst_graph.tracker.start.first_estimate import FirstEstimate, Guess
+from sst_graph.tracker.start.first_estimate import FirstEstimate, StartGuess
 from sst_graph.tracker.window.gaussian import Gaussian, Point
 from sst_graph.types import SemanticClass
 
@@ -90,7 +90,7 @@ class _NotConverged(EstimationError):
         self.reached = reached
 
 
-def first_estimate_steps(drive: Drive, guess: Guess, config: TrackerConfig) -> Stepwise[Point]:
+def first_estimate_steps(drive: Drive, guess: StartGuess, config: TrackerConfig) -> Stepwise[Point]:
     """The batch solution of some scans of the window, step by step.
 
     A short stretch of driving at one speed does not determine the time offset. So the offset stays near the
@@ -188,7 +188,7 @@ def _best(problem: _Problem, starts: Sequence[State], kernels_px: Sequence[float
 
 
 def _starts(
-    drive: Drive, tracks: Tracks, guess: Guess, config: TrackerConfig, reach_s: float
+    drive: Drive, tracks: Tracks, guess: StartGuess, config: TrackerConfig, reach_s: float
 ) -> Stepwise[list[State]]:
     """Where the solutions begin: the candidates that the batch's selection keeps, with offsets within
     ``reach_s`` of the guess's, or the guess itself.
@@ -200,7 +200,7 @@ def _starts(
     enabled = guess.search or guess.cTl is None
     search = dataclasses.replace(calibration.search, time_offset_s=reach_s, enabled=enabled)
     joint = _damped(config) if reach_s == 0.0 else calibration.joint
-    problem = StartProblem([drive], tracks, calibration.classes, guess.cTl, guess.time_offset_s)
+    problem = StartProblem([drive], tracks, calibration.classes, guess)
     selection = yield from select_start_steps(problem, joint.graph, search)
     return [State(cTl, (time_offset_s,)) for cTl, time_offset_s in selection.starts]
 
@@ -261,7 +261,7 @@ def _check_pairs(
 
 
 def prior_gaussian(
-    first: FirstEstimate, guess: Guess, classes: tuple[SemanticClass, ...], config: GraphConfig
+    first: FirstEstimate, guess: StartGuess, classes: tuple[SemanticClass, ...], config: GraphConfig
 ) -> Gaussian:
     """The batch's own weak priors around the guess, and what else is known, linearized at a first estimate.
 

@@ -9,11 +9,11 @@ from sst_graph.stepwise import Stepwise
 from sst_graph.tracker.by_edges.kinds import by_edges, by_labels, of_kind
 from sst_graph.tracker.by_edges.start import first_edge_estimate_steps
 from sst_graph.tracker.config import TrackerConfig
-from sst_graph.tracker.start.first_estimate import FirstEstimate, Guess, Stretch
+from sst_graph.tracker.start.first_estimate import FirstEstimate, StartGuess, Stretch
 from sst_graph.tracker.start.solution import first_estimate_steps
 
 
-def start_steps(stretch: Stretch, guess: Guess, config: TrackerConfig) -> Stepwise[FirstEstimate]:
+def start_steps(stretch: Stretch, guess: StartGuess, config: TrackerConfig) -> Stepwise[FirstEstimate]:
     """The batch solution of some scans, step by step.
 
     Raises:
