@@ -5,11 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import gtsam
 
+from sst_graph.baselines.semalign import solve_semalign
+from sst_graph.baselines.sst_calib import solve_paper, solve_static
 from sst_graph.batch.assumption_tests import examine_assumptions
-from sst_graph.batch.baselines import paper_method, semalign_method, static_method
+from sst_graph.batch.baselines import baseline_method
 from sst_graph.batch.by_edges.both import both_method
 from sst_graph.batch.by_edges.choice import with_method_for, with_method_of
 from sst_graph.batch.by_edges.method import edges_method
@@ -222,22 +225,15 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
     )
 
 
-def labels_and_edges(
-    drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
-) -> MethodEstimate:
-    """The joint method where frames have labels, edges in the others."""
-    return both_method(joint_method, drives, guess, config, progress)
-
-
 _Method = Callable[[Sequence[Drive], Guess, CalibrationConfig, Progress | None], MethodEstimate]
 _METHODS: dict[Method, _Method] = {
     "joint": joint_method,
-    "paper": paper_method,
-    "static": static_method,
-    "semalign": semalign_method,
+    "paper": partial(baseline_method, solve_paper),
+    "static": partial(baseline_method, solve_static),
+    "semalign": partial(baseline_method, solve_semalign),
     "motion": motion_method,
     "edges": edges_method,
-    "both": labels_and_edges,
+    "both": partial(both_method, joint_method),
 }
 _NEED_IMAGE_TRACKS = ("paper", "static", "motion", "edges", "both")
 """Methods whose camera velocity comes from visual odometry."""

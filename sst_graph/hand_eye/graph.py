@@ -167,10 +167,6 @@ class HandEyeTerm:
     factor: gtsam.NonlinearFactor
     covariance: FloatArray
 
-    @property
-    def has_direction(self) -> bool:
-        return len(self.covariance) == 6
-
 
 @dataclass(frozen=True, eq=False)
 class HandEyeTerms:
