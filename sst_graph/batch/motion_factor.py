@@ -19,8 +19,8 @@ from sst_graph.covariance.observability import weak_directions
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
 from sst_graph.graph.outer_loop import KERNELS_PX, solve_joint
-from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
-from sst_graph.hand_eye.solution import difference, solve_motion
+from sst_graph.graph.state import EXTRINSIC, State, difference, time_offset_key
+from sst_graph.hand_eye.solution import solve_motion
 from sst_graph.types import Guess
 
 FloatArray = NDArray[np.float64]

@@ -9,7 +9,8 @@ import numpy as np
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import MethodEstimate
 from sst_graph.drive.preparation import Drive, Progress
-from sst_graph.hand_eye.solution import MotionSolution, alternative, difference, solve_motion
+from sst_graph.graph.state import difference
+from sst_graph.hand_eye.solution import MotionSolution, alternative, solve_motion
 from sst_graph.inspect.gained import KEY, pair_gains, to_document
 from sst_graph.result import FrameId
 from sst_graph.types import Guess

@@ -18,8 +18,7 @@ from sst_graph.errors import EstimationError
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.matching import Tracks, edges_of, match_all
 from sst_graph.graph.outer_loop import JointProblem, JointSolution, robust_weights, solve_joint
-from sst_graph.graph.state import State
-from sst_graph.hand_eye.solution import difference
+from sst_graph.graph.state import State, difference
 from sst_graph.objects.tracks import tracks_of_scans
 
 FloatArray = NDArray[np.float64]

@@ -19,7 +19,7 @@ from sst_graph.drive.path import SensorPath
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import EstimationError
 from sst_graph.graph.convergence import STEP_SIGMAS, step_share
-from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
+from sst_graph.graph.state import EXTRINSIC, State, difference, time_offset_key
 from sst_graph.hand_eye.covariance import hand_eye_covariance
 from sst_graph.hand_eye.graph import (
     CameraStep,
@@ -172,15 +172,10 @@ def _solve(
         # 3. Move, by less and less of the step where robust weights and the LiDAR's motion at the new offset
         # alternate; stop when the step is small.
         step = step_share(outer) * difference(state, moved)
-        state = State(state.cTl.retract(step[:6]), (state.time_offsets_s[0] + float(step[6]),))
+        state = state.moved(step)
         converged = float(step @ np.linalg.solve(covariance, step)) < STEP_SIGMAS**2
     misfit = len(terms) * (3.0 * np.log(scales.rotation) + 2.0 * np.log(scales.direction))
     return MotionSolution(state, centre, terms, scales, covariance, float(misfit), outer, converged)
-
-
-def difference(a: State, b: State) -> FloatArray:
-    """(7,) step from one state to another, in the tangent space of the covariance."""
-    return np.append(gtsam.Pose3.Logmap(a.cTl.between(b.cTl)), b.time_offsets_s[0] - a.time_offsets_s[0])
 
 
 def _optimise(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:

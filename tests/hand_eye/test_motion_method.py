@@ -18,10 +18,10 @@ from sst_graph.cli import main
 from sst_graph.config import with_overrides
 from sst_graph.data import open_source
 from sst_graph.errors import ConfigError
-from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
+from sst_graph.graph.state import EXTRINSIC, State, difference, time_offset_key
 from sst_graph.hand_eye.graph import NoiseScales, camera_steps, hand_eye_terms, lidar_paths, pair_motions
 from sst_graph.hand_eye.initialization import motion_starts
-from sst_graph.hand_eye.solution import MotionSolution, alternative, difference, solve_motion
+from sst_graph.hand_eye.solution import MotionSolution, alternative, solve_motion
 from sst_graph.metrics import calibration_errors
 from sst_graph.result import read_result
 from sst_graph.simulator import SimulationConfig

@@ -36,8 +36,7 @@ from sst_graph.covariance.shared_errors import FEWEST, SharedErrors, spread_cova
 from sst_graph.errors import EstimationError
 from sst_graph.features.lidar_edges import Edge
 from sst_graph.graph.outer_loop import JointProblem
-from sst_graph.graph.state import State
-from sst_graph.hand_eye.solution import difference
+from sst_graph.graph.state import State, difference
 from sst_graph.objects.tracks import ObjectId
 from sst_graph.stepwise import Stepwise, run_to_end
 

@@ -21,7 +21,8 @@ from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.batch.total_covariance import sweep_effects
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.graph.outer_loop import JointSolution, solve_joint
-from sst_graph.hand_eye.solution import MotionSolution, difference
+from sst_graph.graph.state import difference
+from sst_graph.hand_eye.solution import MotionSolution
 from sst_graph.stepwise import run_to_end
 from sst_graph.types import Guess
 

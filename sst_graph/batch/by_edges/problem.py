@@ -21,7 +21,7 @@ from sst_graph.edges.search import KnownRotation, SearchRegion, angle_deg
 from sst_graph.errors import EstimationError
 from sst_graph.graph.matching import DriveEdges, Tracks, edges_of
 from sst_graph.graph.outer_loop import JointProblem
-from sst_graph.graph.state import State
+from sst_graph.graph.state import State, difference
 from sst_graph.hand_eye.solution import MotionSolution, alternative, solve_motion
 from sst_graph.sampling import evenly_spread
 from sst_graph.types import Guess
@@ -214,13 +214,9 @@ def _prior(centre: State, motion: MotionSolution | None, guessed: bool) -> Known
     information, state = np.diag(sigmas**-2.0), centre
     if motion is not None:
         own = np.linalg.inv(motion.covariance + np.diag(_MOTION_FLOOR**2))
-        step = np.append(
-            gtsam.Pose3.Logmap(motion.state.cTl.between(centre.cTl)),
-            centre.time_offsets_s[0] - motion.state.time_offsets_s[0],
-        )
         total = information + own
         # Both Gaussians in the tangent space of motion's estimate.
-        mean = np.linalg.solve(total, information @ step)
-        state = State(motion.state.cTl.retract(mean[:6]), (motion.state.time_offsets_s[0] + float(mean[6]),))
+        step = np.linalg.solve(total, information @ difference(motion.state, centre))
+        state = motion.state.moved(np.asarray(step, np.float64))
         information = total
     return KnownCalibration(state, np.asarray(np.linalg.inv(information), np.float64))
