@@ -23,7 +23,7 @@ from sst_graph.assumptions import ASSUMPTIONS, Assumption, named_sigmas
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.covariance.broken_assumptions import Evidence, considered_sigmas
 from sst_graph.covariance.cluster_robust import RobustCovariance, covariance_of, robust_covariance
-from sst_graph.covariance.considered import AssumptionConfig, Considered, considered_by_matches
+from sst_graph.covariance.considered import AssumptionConfig, Considered
 from sst_graph.covariance.error_model import fit_error_model
 from sst_graph.covariance.match_table import MatchTable, match_table
 from sst_graph.errors import EstimationError
@@ -133,11 +133,9 @@ class ExaminedAssumptions:
 
 def examine_assumptions(problem: CalibrationProblem, estimate: JointEstimate) -> ExaminedAssumptions:
     """Test the assumptions against the data, and consider in the covariance what the data leave open."""
-    config, solution = problem.config.assumptions, estimate.solution
-    findings = check_assumptions(SolvedProblem(problem, solution), config)
-    considered = considered_by_matches(
-        estimate.robust, solution.pairs, solution.values, solution.state, config
-    )
+    config = problem.config.assumptions
+    findings = check_assumptions(SolvedProblem(problem, estimate.solution), config)
+    considered = estimate.considered(config)
     return ExaminedAssumptions(findings, with_test_results(considered, findings))
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.lower_edges import WithLowerEdges, with_lower_edges
 from sst_graph.covariance.cluster_robust import RobustCovariance, robust_covariance
-from sst_graph.covariance.considered import Considered
+from sst_graph.covariance.considered import AssumptionConfig, Considered, considered_by_matches
 from sst_graph.covariance.static_objects import static_covariance
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.graph.matching import GraphConfig, Tracks
@@ -135,6 +135,11 @@ class JointEstimate:
         """The solution with the covariance of its last matches."""
         robust = robust_covariance(solution.graph, solution.values, solution.pairs, solution.state, objects)
         return cls(solution, robust, robust.matrix, static_covariance(robust, solution.pairs))
+
+    def considered(self, config: AssumptionConfig) -> Considered:
+        """What the assumptions that are not estimated add to the covariance."""
+        last = self.solution
+        return considered_by_matches(self.robust, last.pairs, last.values, last.state, config)
 
 
 @dataclass(frozen=True)

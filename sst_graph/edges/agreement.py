@@ -96,17 +96,17 @@ class BlurredScore:
     def of(
         cls,
         edges: DriveEdges,
-        cTl: gtsam.Pose3,
-        time_offset_s: float,
+        state: State,
         blur_px: float,
         known_fields: dict[int, FloatMap],
     ) -> BlurredScore | None:
-        """At a time offset; the pose only takes the points to the camera and back. None without pairs.
+        """At a state's time offset; its pose only takes points to the camera and back. None without pairs.
 
         Args:
             known_fields: fields under this blur by the identity of their gradients; new ones are put there.
         """
-        paired = edges.paired(State(cTl, (time_offset_s,)))
+        cTl, time_offset_s = state.cTl, state.time_offset_s(edges.number)
+        paired = edges.paired(state)
         if paired is None:
             return None
         known = [k for k, each in enumerate(paired.contours) if isinstance(each, PictureGradients)]

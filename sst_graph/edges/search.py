@@ -115,7 +115,8 @@ def _scored(
     """
     blur_px, fields = blur[0] * edges.drive.camera.width / _WIDTH_PX, blur[1]
     before = len(fields)
-    blurred = BlurredScore.of(edges, region.cTl, region.time_offsets_s[number], blur_px, fields)
+    state = State(region.cTl, (region.time_offsets_s[number],))
+    blurred = BlurredScore.of(edges, state, blur_px, fields)
     if blurred is None:
         return []
     yield _FIELD_WORK * (len(fields) - before) + 1
