@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sst_graph.covariance.error_model import ErrorModel
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.monitor.confirmation import (
@@ -28,7 +29,6 @@ from sst_graph.tracker.monitor.statistic import (
     ComparedEstimate,
     EstimateCovariance,
 )
-from sst_graph.tracker.sums.linearized_pair import LinearizedPair
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.tracker.window.matcher import WindowMatcher
 
@@ -72,6 +72,10 @@ class Reference:
     point: Point
     covariance: EstimateCovariance
     scan: int
+
+    def compared(self, model: ErrorModel) -> ComparedEstimate:
+        """For frames whose residuals have some variances."""
+        return ComparedEstimate(self.point, self.covariance, model)
 
 
 @dataclass(frozen=True)
@@ -218,8 +222,7 @@ class ChangeDetector:
         return self.statistic.largest_of_parts(
             [score for own in scores for score in own],
             {(place[a], place[b]) for a, b in parts},
-            estimate.covariance,
-            estimate.model,
+            estimate,
         )
 
     # ------------------------------------------------------------------ new frames
@@ -254,7 +257,7 @@ class ChangeDetector:
         self._before.append(Reference(estimate.point, estimate.covariance, min(views)))
         against = self.reference or self._before[-1]
         scores = self.matcher.linearized_at(against.point, list(views), _KERNEL, self._moving)
-        value = self.statistic.add(scores, against.covariance, estimate.model)
+        value = self.statistic.add(scores, against.compared(estimate.model))
         # 3. Keep the reference, or discard it.
         if self.statistic.exceeded > self.max_pending:
             self.confirmation.unreliable |= self.matcher.objects_of(self.scans) - self._moving
@@ -322,7 +325,7 @@ class ChangeDetector:
             scores = self.matcher.linearized_at(estimate.point, latest, _KERNEL, {*unreliable, *self._moving})
             comparison = None
             if scores:
-                comparison = self.statistic.compare(scores, estimate.covariance, estimate.model)
+                comparison = self.statistic.compare(scores, estimate)
                 if self.statistic.normalized(comparison) > self.config.chi2:
                     return
         if comparison is not None:
@@ -338,12 +341,11 @@ class ChangeDetector:
         """
         scans = [scan for scan in self.scans if scan >= reference.scan]
         pairs = self.matcher.pairs_at(reference.point, scans, _KERNEL)
-        against = ComparedEstimate(reference.point, reference.covariance, estimate.model)
+        against = reference.compared(estimate.model)
 
         def value(*without: int) -> float:
-            return self._value(
-                self.matcher.linearized(pairs, reference.point, {*without, *self._moving}), against
-            )
+            scores = self.matcher.linearized(pairs, reference.point, {*without, *self._moving})
+            return self.statistic.normalized(self.statistic.compare(scores, against))
 
         # The statistic of a step grows with every frame; that of lasting errors of labels does not.
         more = len(scans) / (FRAMES + CONFIRMATIONS)
@@ -353,6 +355,3 @@ class ChangeDetector:
         least = max(threshold, _LEAST_SHARE_OF_OTHERS * whole)
         objects = self.matcher.objects_of(scans) - self._moving
         return whole > least and all(value(track) > least for track in objects)
-
-    def _value(self, scores: Collection[LinearizedPair], estimate: ComparedEstimate) -> float:
-        return self.statistic.normalized(self.statistic.compare(scores, estimate.covariance, estimate.model))
