@@ -185,11 +185,6 @@ class OnlineEstimate:
             return considered
         return considered + self.edges.covariance(self.smoother, self.uncertainty)
 
-    def catch_up(self) -> None:
-        """Repeat the work that a stored review had done."""
-        if self.edges is not None:
-            self.edges.catch_up()
-
     @property
     def softness(self) -> float:
         """Of the matches (:func:`~sst_graph.tracker.by_edges.review.softness`)."""

@@ -13,7 +13,6 @@ from sst_graph.batch.by_edges.reasons import edge_contrast_steps, edges_reasons
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.errors import EstimationError
 from sst_graph.graph.matching import Tracks
-from sst_graph.graph.state import State
 from sst_graph.stepwise import Stepwise
 from sst_graph.tracker.by_edges.review import EdgeReview, review_steps
 from sst_graph.tracker.config import TrackerConfig
@@ -50,17 +49,11 @@ def first_edge_estimate_steps(
     others = [one.state for _, one in candidates]
     contrast = yield from edge_contrast_steps(problem.subset_edges, state, others, calibration.seed)
     reasons = edges_reasons(solution, contrast, motion, np.diag(_START_SIGMAS**2), problem.centre)
+    names = [name for name, _ in calibration.assumptions.estimated]
+    point = Point.of_state(state, calibration.classes, names)
     if stretch.at_end:
-        return FirstEstimate(_point(state, config), problem.known, EdgeReview(reasons), reviewed=False)
+        return FirstEstimate(point, problem.known, EdgeReview(reasons), reviewed=False)
     review = yield from review_steps(problem.whole, state, stretch.tracks, calibration.seed)
     if reasons := tuple(dict.fromkeys((*reasons, *review.reasons))):
         raise EstimationError("; ".join(reasons))
-    return FirstEstimate(_point(state, config), problem.known, review)
-
-
-def _point(state: State, config: TrackerConfig) -> Point:
-    calibration = config.calibration
-    names = tuple(name for name, _ in calibration.assumptions.estimated)
-    biases = [state.biases_px.get((0, c), 0.0) for c in calibration.classes]
-    parameters = np.array([state.nuisances.get(name, 0.0) for name in names])
-    return Point(state.cTl, state.time_offset_s(0), np.array(2 * biases), names=names, parameters=parameters)
+    return FirstEstimate(point, problem.known, review)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 
 from sst_graph.batch.lower_edges import LowerEdgeSupport
@@ -262,12 +261,6 @@ class Initializer:
         smoother = WindowSmoother(prior, start_ns, matcher.classes, graph, config.drift, begin)
         smoother.update(found, set(), window.first_scan, window.objects.live)
         return Initialization(smoother, Uncertainty.of(smoother), len(initial.chosen), initial.first)
-
-    def catch_up(self) -> None:
-        """Repeat the work that a stored search had done."""
-        if self.search is not None:
-            with suppress(*NUMERICAL_ERRORS):
-                self.search.advance(0)
 
     def failed(self, why: str) -> None:
         """An attempt has failed; after some, all of the surroundings of the guess are searched."""

@@ -219,11 +219,8 @@ def _solution(problem: _Problem, start: State, kernels_px: Sequence[float]) -> S
     solution = yield from solve_joint_steps(problem.joint, start, kernels_px)
     yield _COST_WORK
     state = solution.state
-    biases = [state.biases_px.get((0, c), 0.0) for c in calibration.classes]
-    names = tuple(name for name, _ in named_sigmas(calibration.noise.estimate))
-    parameters = np.array([state.nuisances.get(name, 0.0) for name in names])
-    cTl, time_offset_s = state.cTl, state.time_offset_s(0)
-    point = Point(cTl, time_offset_s, np.array(2 * biases), names=names, parameters=parameters)
+    names = [name for name, _ in named_sigmas(calibration.noise.estimate)]
+    point = Point.of_state(state, calibration.classes, names)
     if not solution.converged:
         message = f"the first solution still moved after {solution.outer_iterations} iterations"
         raise _NotConverged(message, _Solved(_cost(problem, point), point))

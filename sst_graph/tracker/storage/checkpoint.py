@@ -263,8 +263,7 @@ def load_checkpoint(
         warnings.simplefilter("ignore")
         _check_tracker(_tracker(document, data, path), path)
         tracker = _tracker(document, data, path)
-        tracker.initializer.catch_up()
-        tracker.estimate.catch_up()
+        _catch_up(tracker)
     if setup is not None:
         check_setup(tracker, setup, path)
     if sweep is not None:
@@ -333,7 +332,7 @@ def _check_tracker(tracker: Tracker, path: str | Path) -> None:
     try:
         checked_camera(tracker.inputs.camera, "camera")
         check_inputs(tracker)
-        tracker.initializer.catch_up()
+        _catch_up(tracker)
         current_update(tracker, tracker.last_update).to_dict()
         consolidate(tracker)
         _again(tracker)
@@ -342,6 +341,14 @@ def _check_tracker(tracker: Tracker, path: str | Path) -> None:
     except Exception as error:
         found = f"a tracker that gives no estimate ({type(error).__name__}: {error})"
         raise CheckpointError(path, found, "all of a tracker") from error
+
+
+def _catch_up(tracker: Tracker) -> None:
+    """Repeat the work that a stored search, or a stored review, had done."""
+    edges = tracker.estimate.edges
+    for under_way in (tracker.initializer.search, None if edges is None else edges.review):
+        if under_way is not None:
+            under_way.catch_up()
 
 
 def _again(tracker: Tracker) -> None:
