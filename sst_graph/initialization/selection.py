@@ -23,7 +23,6 @@ from sst_graph.graph.outer_loop import KERNELS_PX, NARROW_KERNELS_PX, JointSolut
 from sst_graph.graph.state import State
 from sst_graph.initialization.candidates import StartProblem, candidate_steps, label_score_steps
 from sst_graph.initialization.global_search import Candidate, SearchConfig
-from sst_graph.initialization.label_agreement import States
 from sst_graph.initialization.pose_batch import BatchEquations, Poses
 from sst_graph.initialization.refinement import RefinementProblem, refine_steps
 from sst_graph.sampling import evenly_spread
@@ -147,8 +146,7 @@ def select_among_steps(
     poses = yield from refine_steps(full, poses, centres, _NARROW_STAGE)
     equations = yield from full.equation_steps(poses, _NARROW_STAGE[-1])
     # 3. The best that stayed within reach, by boundaries and by all labels.
-    states = States(poses.rotations, poses.translations, poses.offsets)
-    scores = yield from label_score_steps(problem, states, config)
+    scores = yield from label_score_steps(problem, poses, config)
     scores = (
         equations.agreements * np.sqrt(np.maximum(scores, 0.0)) * _in_reach(poses, problem.guess.cTl, config)
     )
