@@ -29,6 +29,8 @@ from sst_graph.tracker.monitor.statistic import (
     ComparedEstimate,
     EstimateCovariance,
 )
+from sst_graph.tracker.start.first_estimate import StartGuess
+from sst_graph.tracker.start.initializer import Restart
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.tracker.window.matcher import WindowMatcher
 
@@ -76,21 +78,6 @@ class Reference:
     def compared(self, model: ErrorModel) -> ComparedEstimate:
         """For frames whose residuals have some variances."""
         return ComparedEstimate(self.point, self.covariance, model)
-
-
-@dataclass(frozen=True)
-class Change:
-    """The calibration has changed.
-
-    Attributes:
-        near: estimate from before the change.
-        scans: how many of the latest scans are surely from after it.
-        far: objects do not meet their labels at all: the new calibration may be anywhere.
-    """
-
-    near: Point
-    scans: int
-    far: bool
 
 
 class ChangeDetector:
@@ -271,22 +258,29 @@ class ChangeDetector:
             self._confirm(estimate)
         return value
 
-    def change(self, estimate: ComparedEstimate) -> Change | None:
-        """The change that is certain from the frames so far; one that is only suspected is noted.
+    def change(self, estimate: ComparedEstimate, chi2: float | None) -> Restart | None:
+        """The restart after a change that is certain from the frames so far; one that is only suspected is
+        noted.
 
         Args:
             estimate: the running one.
+            chi2: the statistic of the latest frames.
         """
         self.suspected_change = ""
         if self.lost:
-            return Change(estimate.point, _LOST_FRAMES, self.far)
+            return self._restart(estimate.point, _LOST_FRAMES, chi2)
         if self.statistic.confirmed:
             if self.reference is not None and self._contradicted(self.reference, estimate):
-                return Change(self.reference.point, self.statistic.exceeded, self.far)
+                return self._restart(self.reference.point, self.statistic.exceeded, chi2)
             self.suspected_change = "a single object contradicts the calibration: a step, or wrong labels"
         elif self.far:
             self.suspected_change = "what ought to be in view does not meet the image's labels"
         return None
+
+    def _restart(self, before: Point, scans: int, chi2: float | None) -> Restart:
+        """From the estimate before a change, with the latest scans, which are surely from after it."""
+        near = StartGuess(before.cTl, before.time_offset_s, search=self.far)
+        return Restart(near, scans, "the calibration has changed", True, chi2)
 
     @property
     def lost(self) -> bool:
@@ -296,7 +290,8 @@ class ChangeDetector:
 
     @property
     def far(self) -> bool:
-        """Whether the latest frames do not meet the image's labels: a change is a large one then."""
+        """Whether the latest frames do not meet the image's labels at all: a change is a large one then, and
+        the new calibration may be anywhere."""
         return self._is_unmatched(CONFIRMATIONS)
 
     def before(self, scan: int) -> Point | None:

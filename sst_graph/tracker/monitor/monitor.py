@@ -44,11 +44,10 @@ class Monitor:
         """
         counts = {scan: len(matches.found[scan].pair) for scan in matches.new}
         chi2 = self.changes.check(sorted(matches.waiting), counts, estimate.for_comparison())
-        change = self.changes.change(estimate.for_comparison())
+        change = self.changes.change(estimate.for_comparison(), chi2)
         if change is not None:
             if self.changes.start_is_over(matches.scan):
-                near = StartGuess(change.near.cTl, change.near.time_offset_s, search=change.far)
-                return chi2, Restart(near, change.scans, "the calibration has changed", True, chi2)
+                return chi2, change
             self.changes.refused_starts += 1
             near = StartGuess(estimate.point.cTl, estimate.point.time_offset_s)
             why = "new frames contradict the start: it is estimated again"
