@@ -175,7 +175,7 @@ def _with_alternative(starts: Sequence[Calibration], scores: FloatArray) -> tupl
     """The first of some starts, best first, after the best one an alternative to it, where there is one."""
     best = starts[0].cTl
     for number, start in enumerate(starts):
-        if scores[number] > ALTERNATIVE_RATIO * scores[0] and _turn_rad(best, start.cTl) > _SAME_RAD:
+        if scores[number] > ALTERNATIVE_RATIO * scores[0] and turn_rad(best, start.cTl) > _SAME_RAD:
             others = [one for other, one in enumerate(starts) if other not in (0, number)]
             return (starts[0], starts[number], *others[: _SELECTED - 1])
     return tuple(starts[:_SELECTED])
@@ -185,7 +185,7 @@ def _far_apart(starts: Sequence[Calibration]) -> tuple[Calibration, ...]:
     """Some starts that are turned by more than :data:`_FAR_RAD` against every better one."""
     chosen: list[Calibration] = []
     for start in starts:
-        if all(_turn_rad(start.cTl, other.cTl) > _FAR_RAD for other in chosen):
+        if all(turn_rad(start.cTl, other.cTl) > _FAR_RAD for other in chosen):
             chosen.append(start)
     return tuple(chosen[:_DISTANT])
 
@@ -193,7 +193,7 @@ def _far_apart(starts: Sequence[Calibration]) -> tuple[Calibration, ...]:
 def _alike(one: State, other: State) -> bool:
     """Whether two solutions lead to one estimate."""
     step = one.cTl.between(other.cTl)
-    near = _turn_rad(one.cTl, other.cTl) < _ALIKE_RAD
+    near = turn_rad(one.cTl, other.cTl) < _ALIKE_RAD
     near &= bool((np.abs(step.translation()) <= _ALIKE_M).all())
     return near and abs(one.time_offsets_s[0] - other.time_offsets_s[0]) <= _ALIKE_S
 
@@ -269,5 +269,6 @@ def _in_reach(poses: Poses, guess: gtsam.Pose3 | None, config: SearchConfig) -> 
     return np.asarray((away < REACH * config.translation_m).all(axis=1))
 
 
-def _turn_rad(one: gtsam.Pose3, other: gtsam.Pose3) -> float:
+def turn_rad(one: gtsam.Pose3, other: gtsam.Pose3) -> float:
+    """Angle between two rotations [rad]."""
     return float(np.linalg.norm(gtsam.Rot3.Logmap(one.rotation().between(other.rotation()))))

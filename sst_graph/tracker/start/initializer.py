@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from sst_graph.batch.lower_edges import LowerEdgeSupport
+from sst_graph.errors import EstimationError
 from sst_graph.stepwise import Stepwise
-from sst_graph.tracker.by_edges.kinds import by_edges
+from sst_graph.tracker.by_edges.kinds import by_edges, by_labels, of_kind
 from sst_graph.tracker.by_edges.review import softness
+from sst_graph.tracker.by_edges.start import first_edge_estimate_steps
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.spread_work import NUMERICAL_ERRORS, SpreadWork
 from sst_graph.tracker.start.first_estimate import FirstEstimate, StartGuess, Stretch
-from sst_graph.tracker.start.solution import prior_gaussian
-from sst_graph.tracker.start.steps import start_steps
+from sst_graph.tracker.start.solution import first_estimate_steps, prior_gaussian
 from sst_graph.tracker.uncertainty import Uncertainty
 from sst_graph.tracker.window.epochs import MatchedPair
 from sst_graph.tracker.window.matcher import WindowMatcher
@@ -79,6 +80,28 @@ class Initialization:
     def softness(self) -> float:
         """Of its matches (:func:`~sst_graph.tracker.by_edges.review.softness`)."""
         return softness(self.first.review, self.uncertainty.covariance)
+
+
+def start_steps(stretch: Stretch, guess: StartGuess, config: TrackerConfig) -> Stepwise[FirstEstimate]:
+    """The batch solution of some scans, step by step: by labels where there are any, by edges otherwise.
+
+    Raises:
+        EstimationError: none.
+    """
+    classes, drive, why = config.calibration.classes, stretch.drive, ""
+    if not by_edges(classes):
+        return FirstEstimate((yield from first_estimate_steps(drive, guess, config)))
+    if by_labels(classes) and all(drive.labelled_ns):
+        labelled = of_kind(drive, edges=False)
+        try:
+            return FirstEstimate((yield from first_estimate_steps(labelled, guess, config)))
+        except EstimationError as error:
+            why = f"by labels: {error}; by edges: "
+    try:
+        unlabelled = replace(stretch, drive=of_kind(drive, edges=True))
+        return (yield from first_edge_estimate_steps(unlabelled, guess, config))
+    except EstimationError as error:
+        raise EstimationError(f"{why}{error}") from error
 
 
 class Search(SpreadWork[FirstEstimate]):

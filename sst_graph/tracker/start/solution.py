@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 
 from sst_graph.association.time_pairing import pair_by_time
@@ -31,7 +30,7 @@ from sst_graph.graph.outer_loop import (
 )
 from sst_graph.graph.state import State
 from sst_graph.initialization.candidates import StartProblem
-from sst_graph.initialization.selection import select_start_steps
+from sst_graph.initialization.selection import select_start_steps, turn_rad
 from sst_graph.stepwise import Stepwise
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.monitor.adoption import held_out_cost
@@ -62,7 +61,7 @@ class _Solved:
 
     def in_other_basin_than(self, other: _Solved) -> bool:
         """Whether the two are in different basins of convergence."""
-        return _turn_rad(self.point.cTl, other.point.cTl) > _OTHER_BASIN_RAD
+        return turn_rad(self.point.cTl, other.point.cTl) > _OTHER_BASIN_RAD
 
 
 @dataclass(frozen=True)
@@ -128,13 +127,9 @@ def _one_of_each_basin(starts: Sequence[State]) -> list[State]:
     """One start of each basin of convergence: those in the basin of an earlier one are left out."""
     chosen: list[State] = []
     for start in starts:
-        if all(_turn_rad(start.cTl, other.cTl) > _OTHER_BASIN_RAD for other in chosen):
+        if all(turn_rad(start.cTl, other.cTl) > _OTHER_BASIN_RAD for other in chosen):
             chosen.append(start)
     return chosen
-
-
-def _turn_rad(one: gtsam.Pose3, other: gtsam.Pose3) -> float:
-    return float(np.linalg.norm(gtsam.Rot3.Logmap(one.between(other).rotation())))
 
 
 def _all_of(attempts: Sequence[Stepwise[_Solved]]) -> Stepwise[tuple[list[_Solved], list[EstimationError]]]:
