@@ -182,7 +182,7 @@ class LinearProblem:
         solution = problem.solve_with(names, start, _ALL_FREE_KERNELS_PX, len(_ALL_FREE_KERNELS_PX))
         graph, at, pairs = solution.graph, solution.values, solution.pairs
         unknowns = Unknowns.of(solution.state, pairs)
-        table = match_table(graph, at, pairs, solution.matched_at, problem.objects, unknowns)
+        table = match_table(graph, at, pairs, solution.frozen.state, problem.objects, unknowns)
         information = scaled_inverse(marginal_covariance(graph, at, unknowns))
         state = state_from(at, solution.state, pairs)
         return cls(table, unknowns, information, {name: state.nuisances[name] for name in names}, state)

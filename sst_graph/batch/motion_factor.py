@@ -28,8 +28,9 @@ FloatArray = NDArray[np.float64]
 MAX_DISAGREEMENT_CHI2 = 40.0
 """Chi-squared, of 7, of the difference between labels and motion up to which the motion is used: both
 covariances may be too small by a factor of 1.7 for an agreement that a 95 % quantile (14.07) would accept."""
-_UNLIKELY_CHI2 = 14.07
-"""95 % quantile of chi-squared with 7 degrees of freedom."""
+UNLIKELY_CHI2 = 14.07
+"""95 % quantile of chi-squared with 7 degrees of freedom: beyond it a covariance grows by Birge's ratio,
+squared."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +118,7 @@ def fuse_motion(
     joint = replace(problem.joint(), centre=problem.prior_centre(state), prior=factor)
     solution = solve_joint(joint, state, KERNELS_PX[-1:], problem.progress)
     # 4. The covariance; Birge's ratio, squared, where labels and motion differ by more than theirs allow.
-    inflation = chi2 / len(step) if chi2 > _UNLIKELY_CHI2 else 1.0
+    inflation = chi2 / len(step) if chi2 > UNLIKELY_CHI2 else 1.0
     fused = JointEstimate.of(solution, problem.objects)
     static = fused.by_static_objects if config.use_motion == "always" else labels.by_static_objects
     fused = replace(fused, covariance=inflation * fused.covariance, by_static_objects=static)

@@ -114,8 +114,7 @@ class JointSolution:
         matches: its matches, drive by drive.
         outer_iterations: outer iterations done.
         converged: the last step was short compared with the sigmas of the frozen problem.
-        matched_at: the state that the matches were made at.
-        frozen, optimum: the last frozen problem and its optimum.
+        frozen, optimum: the last frozen problem, at the state that the matches were made at, and its optimum.
         iterations: how the estimate was reached.
         problem: that was solved.
         centre: what its weak priors were centred on.
@@ -125,7 +124,6 @@ class JointSolution:
     matches: Sequence[DriveMatches]
     outer_iterations: int
     converged: bool
-    matched_at: State
     frozen: FrozenProblem
     optimum: FrozenPoint
     iterations: tuple[OuterIteration, ...]
@@ -209,16 +207,7 @@ def solve_joint_steps(
                 break
     _LOG.info("joint: %d outer iterations, %d pairs", outer + 1, pairs)
     return JointSolution(
-        state,
-        matches,
-        outer + 1,
-        converged,
-        frozen.state,
-        frozen,
-        optimum,
-        tuple(iterations),
-        problem,
-        centre,
+        state, matches, outer + 1, converged, frozen, optimum, tuple(iterations), problem, centre
     )
 
 

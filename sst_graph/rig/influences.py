@@ -183,7 +183,7 @@ def _by_motion(robust: RobustCovariance, solution: JointSolution) -> tuple[IntAr
     values, unknowns = solution.values, robust.unknowns
     cTl = values.atPose3(EXTRINSIC)
     responses = twist_responses(solution.graph, values, unknowns)
-    back = np.asarray(solution.matched_at.cTl.inverse().AdjointMap()).T
+    back = np.asarray(solution.frozen.state.cTl.inverse().AdjointMap()).T
     found: dict[int, FloatArray] = {}
     seen: set[int] = set()
     for pair in solution.pairs:
@@ -192,7 +192,7 @@ def _by_motion(robust: RobustCovariance, solution: JointSolution) -> tuple[IntAr
             continue
         seen.add(key)
         clock = time_offset_key(solution.state.clock(pair.drive))
-        since_s = float(values.atVector(clock)[0]) - solution.matched_at.time_offset_s(pair.drive)
+        since_s = float(values.atVector(clock)[0]) - solution.frozen.state.time_offset_s(pair.drive)
         sample = pair.l_twist
         _, by_cTl, by_offset = transferred(
             sample.twist, sample.acceleration, since_s, values.atVector(key), cTl, True

@@ -17,13 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.batch.method_estimate import MethodEstimate
+from sst_graph.batch.motion_factor import UNLIKELY_CHI2
 from sst_graph.graph.state import State, difference
 
 FloatArray = NDArray[np.float64]
-
-UNLIKELY_CHI2 = 14.07
-"""95 % quantile of chi-squared with 7 degrees of freedom: beyond it the covariance grows by Birge's ratio,
-squared."""
 
 
 @dataclass(frozen=True)
