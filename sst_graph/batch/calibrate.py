@@ -46,7 +46,7 @@ from sst_graph.drive.preparation import TRACK_INTERVAL_S, Drive, PrepareConfig, 
 from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.odometry.sweep import with_sweep
 from sst_graph.result import CalibrationResult
-from sst_graph.types import Guess, SemanticClass, Source
+from sst_graph.types import Guess, Source
 from sst_graph.validation import checked_guess
 
 
@@ -98,21 +98,13 @@ def prepare_drives(
     prepare = preparation_of(config)
     with_lower_edges = config.method in ("joint", "both") and config.lower_edges != "never"
     depth = config.method in _NEED_DEPTH
-    classes = prepared_classes(config)
     if config.method == "edges":
         sources = [GeometricallyLabelled(source) for source in sources]
     # One drive after the other, for the frames that the sweep is decided by are kept until they are read.
     return [
-        prepare_drive(source, classes, prepare, progress, depth, with_lower_edges)
+        prepare_drive(source, config.prepared_classes, prepare, progress, depth, with_lower_edges)
         for source in (with_sweep(source, config.decide_sweep) for source in sources)
     ]
-
-
-def prepared_classes(config: CalibrationConfig) -> tuple[SemanticClass, ...]:
-    """Classes that drives are prepared with: edges need objects of no class."""
-    if config.method == "edges":
-        return (SemanticClass.OBJECT,)
-    return (*config.classes, SemanticClass.OBJECT) if config.method == "both" else config.classes
 
 
 def preparation_of(config: CalibrationConfig) -> PrepareConfig:

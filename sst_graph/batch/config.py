@@ -122,6 +122,13 @@ class CalibrationConfig(Settings):
         return PrepareConfig(self.max_range_m, self.image_edges, self.lidar_odometry)
 
     @property
+    def prepared_classes(self) -> tuple[SemanticClass, ...]:
+        """Classes that drives are prepared with: edges need objects of no class."""
+        if self.method == "edges":
+            return (SemanticClass.OBJECT,)
+        return (*self.classes, SemanticClass.OBJECT) if self.method == "both" else self.classes
+
+    @property
     def joint(self) -> JointConfig:
         """The joint method under this noise."""
         return JointConfig(self.noise)

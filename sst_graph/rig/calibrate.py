@@ -17,7 +17,6 @@ from sst_graph.batch.calibrate import (
     finished,
     preparation_of,
     prepare_drives,
-    prepared_classes,
     solve_problem,
 )
 from sst_graph.batch.config import CalibrationConfig
@@ -100,7 +99,7 @@ def prepare_rig(
     drives = {first: prepare_drives(own, config, progress)}
     for name, theirs in others:
         drives[name] = [
-            with_camera(drive, source, prepared_classes(config), preparation_of(config), progress)
+            with_camera(drive, source, config.prepared_classes, preparation_of(config), progress)
             for drive, source in zip(drives[first], theirs, strict=True)
         ]
     return drives
