@@ -18,7 +18,7 @@ from sst_graph.graph.outer_loop import (
     solve_joint,
 )
 from sst_graph.graph.state import State
-from sst_graph.initialization.candidates import StartProblem
+from sst_graph.initialization.candidates import StartProblem, prior_centre
 from sst_graph.initialization.selection import select_start_steps
 from sst_graph.result import CalibrationResult
 from sst_graph.stepwise import run_to_end
@@ -78,7 +78,7 @@ def fit_labels(config: CalibrationConfig) -> Fitter:
             )
             cTl, found_s = selection.starts[0]
             start = State(cTl, (found_s,))
-            problem = JointProblem(few, tracks, joint, search.centre(start))
+            problem = JointProblem(few, tracks, joint, prior_centre(guess, start))
             solution = solve_joint(problem, start, NARROW_KERNELS_PX)
         except EstimationError:
             return None

@@ -23,7 +23,7 @@ from sst_graph.graph.outer_loop import (
     solve_all,
 )
 from sst_graph.graph.state import State
-from sst_graph.initialization.candidates import StartProblem
+from sst_graph.initialization.candidates import StartProblem, prior_centre
 from sst_graph.initialization.selection import Selection, alternatives, select_start_steps
 from sst_graph.objects.tracks import ObjectId, object_tracks
 from sst_graph.stepwise import run_to_end
@@ -70,7 +70,7 @@ class CalibrationProblem:
 
     def prior_centre(self, state: State) -> State:
         """What the weak priors of a solution from or at a state are centred on."""
-        return self._start_problem().centre(state)
+        return prior_centre(self.guess, state)
 
     def joint(self) -> JointProblem:
         """The graph's part of the problem."""
@@ -82,7 +82,9 @@ class CalibrationProblem:
         Raises:
             EstimationError: no candidate leads anywhere.
         """
-        return run_to_end(select_start_steps(self._start_problem(), self.config.noise, self.config.search))
+        # Without the tracks of objects.
+        problem = StartProblem(self.drives, Tracks(self.drives), self.config.classes, self.guess)
+        return run_to_end(select_start_steps(problem, self.config.noise, self.config.search))
 
     def with_noise(self, noise: GraphConfig) -> CalibrationProblem:
         """The problem with another noise of the joint graph."""
@@ -108,10 +110,6 @@ class CalibrationProblem:
         starts = [State(cTl, (time_offset_s,) * clocks) for cTl, time_offset_s in selection.starts]
         centred = [(start, self.prior_centre(start)) for start in starts]
         return solve_all(self.joint(), centred, kernels_px, self.progress)
-
-    def _start_problem(self) -> StartProblem:
-        """What a start is searched for, without the tracks of objects."""
-        return StartProblem(self.drives, Tracks(self.drives), self.config.classes, self.guess)
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,8 @@ _SOME = 60_000
 """Points, times poses, that are projected at once: their arrays fit into the cache."""
 
 
-def agreement_of_points(edges: Sequence[DriveEdges], state: State, blur_px: float) -> list[FloatArray]:
-    """For each drive, (n,) share of each boundary point in view in the score at a state.
+def score(edges: Sequence[DriveEdges], state: State, blur_px: float) -> float:
+    """The score of a state: see the module.
 
     Args:
         blur_px: sigma of the blur, across each point's edge alone [px].
@@ -63,13 +63,8 @@ def agreement_of_points(edges: Sequence[DriveEdges], state: State, blur_px: floa
         weights /= weights.sum()
         strengths = profiles([each for each, _ in groups], [span for _, span in groups], uvs, ways, ts)
         known = well_inside(uvs[:, 0], uvs[:, 1], paired.camera.width, paired.camera.height)
-        found.append(np.where(known, weights @ strengths, 0.0))
-    return found
-
-
-def score(edges: Sequence[DriveEdges], state: State, blur_px: float) -> float:
-    """The score of a state: see the module."""
-    return float(sum(values.sum() for values in agreement_of_points(edges, state, blur_px)))
+        found.append(np.where(known, weights @ strengths, 0.0).sum())
+    return float(sum(found))
 
 
 @dataclass(frozen=True)

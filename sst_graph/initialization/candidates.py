@@ -57,10 +57,11 @@ class StartProblem:
     classes: Sequence[SemanticClass]
     guess: Guess
 
-    def centre(self, start: State) -> State:
-        """What the weak priors are centred on: the guess, or a start's rotation without a translation."""
-        cTl = self.guess.cTl or gtsam.Pose3(start.cTl.rotation(), np.zeros(3))
-        return State(cTl, (self.guess.time_offset_s,) * len(start.time_offsets_s))
+
+def prior_centre(guess: Guess, start: State) -> State:
+    """What the weak priors are centred on: the guess, or a start's rotation without a translation."""
+    cTl = guess.cTl or gtsam.Pose3(start.cTl.rotation(), np.zeros(3))
+    return State(cTl, (guess.time_offset_s,) * len(start.time_offsets_s))
 
 
 def candidate_steps(problem: StartProblem, config: SearchConfig) -> Stepwise[list[Candidate]]:

@@ -15,12 +15,10 @@ from sst_graph.drive.trajectory import GrowingTrack
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.matching import (
     DYNAMIC_REACH_M,
-    DriveEdges,
     GraphConfig,
     PairMatches,
     Tracks,
     associate,
-    edges_of,
 )
 from sst_graph.graph.outer_loop import KERNELS_PX
 from sst_graph.tracker.by_edges.kinds import EDGE_KERNEL_SHARE, by_edges, by_labels, of_kind
@@ -213,11 +211,6 @@ class WindowMatcher:
             yield of_kind(part, edges=False), kernel, self.graph
         narrow = replace(kernel, scale=EDGE_KERNEL_SHARE * kernel.scale)
         yield of_kind(part, edges=True), narrow, replace(self.graph, edge_peaks=True)
-
-    def edges_of(self, chosen: Collection[int]) -> list[DriveEdges]:
-        """The boundary points of objects without a class of some scans."""
-        part, numbers = self.window.drive(chosen.__contains__)
-        return edges_of([of_kind(part, edges=True)], self._tracks(part, numbers), self.graph)
 
     def _linearized(
         self,
