@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 
+UNKNOWN_SIGMAS = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
+"""(7,) deviations of what is not known at all [rad, m, s]."""
 PACKAGES = ("sst-graph", "gtsam", "numpy", "scipy", "small_gicp")
 
 
@@ -185,11 +187,10 @@ def guess_as_result(
     drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, reason: str
 ) -> CalibrationResult:
     """The result where no estimate could be made: the guess, with large sigmas."""
-    sigmas = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
     return CalibrationResult(
         T_camera_lidar=guess.cTl or gtsam.Pose3(),
         time_offset_s=guess.time_offset_s,
-        covariance=np.diag(sigmas**2),
+        covariance=np.diag(UNKNOWN_SIGMAS**2),
         status="unobservable",
         camera=drives[0].camera,
         reasons=(reason,),

@@ -100,10 +100,8 @@ class PartSolver:
         extra = estimate.considered(self.problem.config.assumptions).covariance(7)
         # By static objects alone: a vehicle that brakes looks like another time offset.
         covariance = estimate.by_static_objects[:7, :7] + extra
-        table = estimate.robust.table
-        weights = np.bincount(table.sides, table.root_weights**2)
-        clusters = float(weights.sum() ** 2 / max(float(weights @ weights), 1e-12))
-        return PartEstimate(difference(self.reference_of(part), solution.state), covariance, clusters)
+        step = difference(self.reference_of(part), solution.state)
+        return PartEstimate(step, covariance, estimate.robust.table.clusters)
 
     def _data(self, part: Part) -> tuple[Drive, Tracks]:
         """The drive and its tracks, of the part's scans alone."""

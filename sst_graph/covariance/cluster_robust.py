@@ -80,9 +80,8 @@ def covariance_of(
     """
     scores = table.scores if scores is None else scores
     covariance = bread + bread @ scores.excess(model) @ bread
-    steps = steps_without_objects(table, bread)
-    weights = np.asarray(np.bincount(table.objects, table.root_weights**2), np.float64)
-    covariance = composed(covariance, ObjectSpread.of(steps, weights), table.weight_curvature_ratio)
+    spread = ObjectSpread.of(steps_without_objects(table, bread), table.object_weights)
+    covariance = composed(covariance, spread, table.weight_curvature_ratio)
     return np.asarray(0.5 * (covariance + covariance.T))
 
 

@@ -56,6 +56,17 @@ class MatchTable:
         """(m,) number of the object over all frames, from 0 on."""
         return np.unique(self.sides // SIDES, return_inverse=True)[1].reshape(-1)
 
+    @property
+    def object_weights(self) -> FloatArray:
+        """By object, the sum of the robust weights of its matches."""
+        return np.asarray(np.bincount(self.objects, self.root_weights**2), np.float64)
+
+    @property
+    def clusters(self) -> float:
+        """How many sides of equal weight would weigh as unevenly as these: (sum w)^2 / sum w^2."""
+        weights = np.bincount(self.sides, self.root_weights**2)
+        return float(weights.sum() ** 2 / max(float(weights @ weights), 1e-12))
+
     def take(self, index: IntArray) -> MatchTable:
         """Some of the matches, by position."""
         names = ("J", "root_weights", "curvatures", "r", "sides", "frames")

@@ -83,8 +83,7 @@ class CameraInfluences:
         # 1. How the parts of the covariance are composed.
         modelled = robust.bread + robust.bread @ scores.excess(robust.model) @ robust.bread
         left_out = steps_without_objects(robust.table, robust.bread)
-        weights = np.asarray(np.bincount(robust.table.objects, robust.table.root_weights**2), np.float64)
-        spread = ObjectSpread.of(left_out, weights)
+        spread = ObjectSpread.of(left_out, robust.table.object_weights)
         of_model, of_objects = spread.shares(modelled)
         ratio = bounded_ratio(robust.table.weight_curvature_ratio)
         root = ratio * np.sqrt(of_model)

@@ -101,8 +101,7 @@ def test_the_sums_are_the_batch_s(
     objects = [pair.objects for pair in window if pair.objects is not None]
     spread = sums.objects.spread(objects, naive, point)
     steps = steps_without_objects(robust.table, robust.bread)
-    weights = np.asarray(np.bincount(robust.table.objects, robust.table.root_weights**2), np.float64)
-    of_batch = ObjectSpread.of(steps, weights)
+    of_batch = ObjectSpread.of(steps, robust.table.object_weights)
     assert spread.number == pytest.approx(of_batch.number, rel=1e-9)
     by_model = naive + naive @ sums.excess(window, own, model) @ naive
     exact = composed(by_model[np.ix_(columns, columns)], of_batch, ratio)[:7, :7]
