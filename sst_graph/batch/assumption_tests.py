@@ -109,34 +109,18 @@ class SolvedProblem:
         return solve_joint(replace(self.problem.joint(), config=free, centre=centre), start, kernels_px)
 
 
-@dataclass(frozen=True)
-class ExaminedAssumptions:
-    """The assumptions of a joint estimate: tests against the data, and what they add to the covariance.
+def examine_assumptions(
+    problem: CalibrationProblem, estimate: JointEstimate
+) -> tuple[tuple[ParameterTest, ...], Considered]:
+    """Test the assumptions against the data, and consider in the covariance what the data leave open.
 
-    Attributes:
-        findings: of the tests, the most contradicted first.
-        considered: what the assumptions add to the covariance, the tests' results included.
+    Returns:
+        The tests, the most contradicted first, and what the assumptions add to the covariance.
     """
-
-    findings: tuple[ParameterTest, ...]
-    considered: Considered
-
-    @property
-    def reasons(self) -> tuple[str, ...]:
-        """A sentence where the data contradict an assumption."""
-        return contradiction_sentence(self.findings)
-
-    def report(self) -> dict[str, Any]:
-        """As :func:`assumption_report`."""
-        return assumption_report(self.considered, self.findings)
-
-
-def examine_assumptions(problem: CalibrationProblem, estimate: JointEstimate) -> ExaminedAssumptions:
-    """Test the assumptions against the data, and consider in the covariance what the data leave open."""
     config = problem.config.assumptions
     findings = check_assumptions(SolvedProblem(problem, estimate.solution), config)
     considered = estimate.considered(config)
-    return ExaminedAssumptions(findings, with_test_results(considered, findings))
+    return findings, with_test_results(considered, findings)
 
 
 def check_assumptions(problem: SolvedProblem, config: AssumptionConfig) -> tuple[ParameterTest, ...]:

@@ -11,7 +11,7 @@ import gtsam
 
 from sst_graph.baselines.semalign import solve_semalign
 from sst_graph.baselines.sst_calib import solve_paper, solve_static
-from sst_graph.batch.assumption_tests import examine_assumptions
+from sst_graph.batch.assumption_tests import assumption_report, contradiction_sentence, examine_assumptions
 from sst_graph.batch.baselines import baseline_method
 from sst_graph.batch.by_edges.both import both_method
 from sst_graph.batch.by_edges.choice import with_method_for, with_method_of
@@ -188,9 +188,9 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
     labels_alone = JointEstimate.of(solutions[0], problem.objects)
     motion = with_motion(problem, labels_alone, contradictions.stretches)
     # 6. Assumptions: tested against the data, considered in the covariance.
-    assumptions = examine_assumptions(problem, motion.estimate)
+    tests, considered = examine_assumptions(problem, motion.estimate)
     # 7. Total covariance: with unmeasured motion and undecided sweeps, which no match shows.
-    total = total_covariance(problem, motion.estimate, assumptions.considered)
+    total = total_covariance(problem, motion.estimate, considered)
     # 8. How it fits the labels, point by point.
     fit = fit_of(problem, (start_solution, lower.solutions[0], motion.estimate.solution), total.covariance)
     # 9. The estimate, and why it may be wrong.
@@ -201,16 +201,20 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
         solution.state.time_offsets_s[0],
         total.covariance,
         frames_used(drives, solution),
-        (*assumptions.reasons, *wrong, *contradictions.sentences, *motion.reasons, *total.reasons),
+        (*contradiction_sentence(tests), *wrong, *contradictions.sentences, *motion.reasons, *total.reasons),
         (*unknown_motion_remarks(drives), *motion.remarks),
         motion.estimate.by_static_objects[:7, :7],
         drive_offsets(drives, solution.state, unknowns),
         total.by_drive,
         agreement
         | {"start_score": start.score, "contradictions": contradictions.diagnostics}
-        | {"motion": motion.diagnostics, "assumptions": assumptions.report(), BUDGET: total.budget}
+        | {
+            "motion": motion.diagnostics,
+            "assumptions": assumption_report(considered, tests),
+            BUDGET: total.budget,
+        }
         | joint_diagnostics(problem, motion.estimate, lower),
-        JointOutcome(problem, motion.estimate, assumptions.considered),
+        JointOutcome(problem, motion.estimate, considered),
         fit,
         total.by_sweeps,
         total.reasons,
