@@ -10,7 +10,7 @@ import numpy as np
 
 from sst_graph.association.time_pairing import pair_by_time
 from sst_graph.assumptions import named_sigmas
-from sst_graph.drive.preparation import Drive
+from sst_graph.drive.preparation import Drive, boundary_count
 from sst_graph.errors import EstimationError
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.building import (
@@ -18,7 +18,7 @@ from sst_graph.graph.building import (
     PRIOR_ROTATION_SIGMA_RAD,
     PRIOR_TRANSLATION_SIGMA_M,
 )
-from sst_graph.graph.matching import GraphConfig, Tracks
+from sst_graph.graph.matching import GraphConfig, Tracks, associate
 from sst_graph.graph.outer_loop import (
     KERNELS_PX,
     MIN_EXPLAINED,
@@ -33,9 +33,9 @@ from sst_graph.initialization.candidates import StartProblem
 from sst_graph.initialization.selection import select_start_steps, turn_rad
 from sst_graph.stepwise import Stepwise
 from sst_graph.tracker.config import TrackerConfig
-from sst_graph.tracker.monitor.adoption import held_out_cost
 from sst_graph.tracker.start.first_estimate import FirstEstimate, StartGuess
 from sst_graph.tracker.window.gaussian import Gaussian, Point
+from sst_graph.tracker.window.matcher import mean_cost
 from sst_graph.types import SemanticClass
 
 _OTHER_BASIN_RAD = float(np.radians(2.0))
@@ -228,9 +228,12 @@ def _solution(problem: _Problem, start: State, kernels_px: Sequence[float]) -> S
 
 def _cost(problem: _Problem, point: Point) -> float:
     """Mean cost of all boundary points of the window."""
-    joint, classes = problem.config.calibration.joint, problem.config.calibration.classes
+    graph, classes = problem.config.calibration.noise, problem.config.calibration.classes
     kernel = RobustKernel("geman_mcclure", KERNELS_PX[-1])
-    cost = held_out_cost(problem.drive, problem.tracks, point, classes, kernel, joint.graph)
+    pairs = associate([problem.drive], problem.tracks, point.state(classes), kernel, graph)
+    scans, below = problem.drive.scans, graph.lower_edges
+    counted = [(pair, boundary_count(scans[pair.pair.scan], below)) for pair in pairs]
+    cost = mean_cost(counted, point, classes, kernel)
     if cost is None:
         raise EstimationError("no boundary point meets an image")
     return cost
