@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import gtsam
 
@@ -24,12 +24,6 @@ def preflight(
         guess: where the calibration starts, or None.
         classes: that are aligned; empty where labels are not used.
     """
-    return tuple(dict.fromkeys(_preflight(drives, guess, classes)))
-
-
-def _preflight(
-    drives: Sequence[Drive], guess: gtsam.Pose3 | None, classes: Sequence[SemanticClass]
-) -> Iterator[Finding]:
     found = [units.start_unit(guess)]
     for drive in drives:
         found += [cameras.image_size(drive.camera), clocks.stamps(drive), clocks.two_clocks(drive)]
@@ -39,7 +33,7 @@ def _preflight(
     if classes:
         found.append(labels.searched_classes(drives, classes))
         found.append(labels.shifted_masks(labels.shift(drives)))
-    yield from (finding for finding in found if finding is not None)
+    return tuple(dict.fromkeys(finding for finding in found if finding is not None))
 
 
 def likely_causes(drives: Sequence[Drive], guess: Guess, fit: Fitter) -> tuple[Finding, ...]:

@@ -81,7 +81,6 @@ _PACKAGES = (
     "sst_graph.objects",
     "sst_graph.odometry",
     "sst_graph.result",
-    "sst_graph.odometry.sweep",
     "sst_graph.sweep_timing",
     "sst_graph.tracker",
     "sst_graph.types",
