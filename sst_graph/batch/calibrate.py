@@ -17,7 +17,7 @@ from sst_graph.batch.by_edges.both import both_method
 from sst_graph.batch.by_edges.choice import with_method_for, with_method_of
 from sst_graph.batch.by_edges.method import edges_method
 from sst_graph.batch.causes import with_causes
-from sst_graph.batch.config import CalibrationConfig, Method
+from sst_graph.batch.config import CalibrationConfig, Method, prepared_classes
 from sst_graph.batch.contradictions import find_contradictions
 from sst_graph.batch.joint_report import (
     fit_of,
@@ -102,7 +102,7 @@ def prepare_drives(
         sources = [GeometricallyLabelled(source) for source in sources]
     # One drive after the other, for the frames that the sweep is decided by are kept until they are read.
     return [
-        prepare_drive(source, config.prepared_classes, prepare, progress, depth, with_lower_edges)
+        prepare_drive(source, prepared_classes(config), prepare, progress, depth, with_lower_edges)
         for source in (with_sweep(source, config.decide_sweep) for source in sources)
     ]
 

@@ -122,13 +122,6 @@ class CalibrationConfig(Settings):
         return PrepareConfig(self.max_range_m, self.image_edges, self.lidar_odometry)
 
     @property
-    def prepared_classes(self) -> tuple[SemanticClass, ...]:
-        """Classes that drives are prepared with: edges need objects of no class."""
-        if self.method == "edges":
-            return (SemanticClass.OBJECT,)
-        return (*self.classes, SemanticClass.OBJECT) if self.method == "both" else self.classes
-
-    @property
     def joint(self) -> JointConfig:
         """The joint method under this noise."""
         return JointConfig(self.noise)
@@ -137,3 +130,10 @@ class CalibrationConfig(Settings):
     def estimating(self) -> CalibrationConfig:
         """The same with a variable in method joint's graph for each assumption that is to be estimated."""
         return replace(self, noise=replace(self.noise, estimate=self.assumptions.estimate))
+
+
+def prepared_classes(config: CalibrationConfig) -> tuple[SemanticClass, ...]:
+    """Classes that drives are prepared with: edges need objects of no class."""
+    if config.method == "edges":
+        return (SemanticClass.OBJECT,)
+    return (*config.classes, SemanticClass.OBJECT) if config.method == "both" else config.classes

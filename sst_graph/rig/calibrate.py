@@ -19,7 +19,7 @@ from sst_graph.batch.calibrate import (
     prepare_drives,
     solve_problem,
 )
-from sst_graph.batch.config import CalibrationConfig
+from sst_graph.batch.config import CalibrationConfig, prepared_classes
 from sst_graph.batch.method_estimate import UNKNOWN_SIGMAS, MethodEstimate
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.batch.sources import as_sources
@@ -99,7 +99,7 @@ def prepare_rig(
     drives = {first: prepare_drives(own, config, progress)}
     for name, theirs in others:
         drives[name] = [
-            with_camera(drive, source, config.prepared_classes, preparation_of(config), progress)
+            with_camera(drive, source, prepared_classes(config), preparation_of(config), progress)
             for drive, source in zip(drives[first], theirs, strict=True)
         ]
     return drives

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from sst_graph.batch.config import CalibrationConfig
+from sst_graph.batch.config import CalibrationConfig, prepared_classes
 from sst_graph.config import Settings, setting
 
 
@@ -106,7 +106,7 @@ class TrackerConfig(Settings):
         """The same with a variable in the graph for each assumption that is to be estimated, and with objects
         without a class among the classes where edges are aligned."""
         calibration = self.calibration.estimating
-        calibration = replace(calibration, classes=calibration.prepared_classes)
+        calibration = replace(calibration, classes=prepared_classes(calibration))
         if calibration.method == "edges":
             calibration = replace(calibration, lower_edges="never")
         return replace(self, calibration=calibration)
