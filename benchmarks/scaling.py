@@ -37,7 +37,6 @@ from numpy.typing import NDArray
 
 from sst_graph import CalibrationConfig, open_source
 from sst_graph.batch.calibrate import calibrate_prepared, prepare_drives
-from sst_graph.batch.method_estimate import Guess
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.drive.preparation import Drive
 from sst_graph.factors.camera import PinholeCamera
@@ -46,7 +45,7 @@ from sst_graph.graph.state import State
 from sst_graph.rig.calibrate import calibrate_rig_prepared, prepare_rig
 from sst_graph.rig.known import KnownRig
 from sst_graph.simulator import SimulationConfig, simulate, write_drive
-from sst_graph.types import CameraImage, Frame, GroundTruth, Scan, SemanticClass
+from sst_graph.types import CameraImage, Frame, GroundTruth, Guess, Scan, SemanticClass
 
 COSTS, WHOLE = ("prepare [s]", "12 iterations [s]", "peak memory [MB]"), "whole estimate [s]"
 ITERATIONS, FRAMES, STREET_FRAMES, PERIOD_NS = 12, 6, 41, 100_000_000

@@ -225,6 +225,14 @@ class Calibration(ByValue):
         return iter((self.cTl, self.time_offset_s))
 
 
+@dataclass(frozen=True)
+class Guess:
+    """What is known of a calibration beforehand: an extrinsic, or None, and a time offset [s]."""
+
+    cTl: gtsam.Pose3 | None
+    time_offset_s: float = 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class GroundTruth(ByValue):
     """What is known to be true of a drive (simulated, or a published reference).

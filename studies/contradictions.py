@@ -19,14 +19,13 @@ import numpy as np
 from sst_graph import CalibrationConfig
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.batch.contradictions import Contradictions, find_contradictions
-from sst_graph.batch.method_estimate import Guess
 from sst_graph.batch.part_solver import PartSolver
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.errors import EstimationError
 from sst_graph.graph.outer_loop import NARROW_KERNELS_PX, solve_joint
 from sst_graph.graph.state import State
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
-from sst_graph.types import Frame, Source
+from sst_graph.types import Frame, Guess, Source
 
 FRAMES = 30
 MOTIONS = ("mixed", "stop_and_go", "no_stop", "turning", "standing", "mixed", "constant", "stop_and_go")

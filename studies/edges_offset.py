@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from sst_graph import CalibrationConfig, open_source
 from sst_graph.batch.by_edges.parts import thinned
 from sst_graph.batch.calibrate import prepare_drives
-from sst_graph.batch.method_estimate import Guess
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.drive.preparation import Drive
 from sst_graph.edges.agreement import score
 from sst_graph.features.lidar_edges import Edge
 from sst_graph.graph.matching import edges_of
 from sst_graph.graph.state import State
+from sst_graph.types import Guess
 
 FloatArray = NDArray[np.float64]
 OFFSETS_MS = np.array([-30.0, -22.0, -15.0, -10.0, -6.0, 6.0, 10.0, 15.0, 20.0, 25.0, 32.0, 40.0])

@@ -13,12 +13,12 @@ import argparse
 import numpy as np
 
 from sst_graph import CalibrationConfig
-from sst_graph.batch.method_estimate import Guess
 from sst_graph.metrics import nees, tangent_error
 from sst_graph.rig import KnownPose, KnownRig, RigResult
 from sst_graph.rig.calibrate import calibrate_rig_prepared, prepare_rig
 from sst_graph.simulator import SimulatedDrive
 from sst_graph.simulator.rig import beside, stereo_pose, with_mounts
+from sst_graph.types import Guess
 from studies.edges_streets import source_of, start_step
 
 CONFIG = CalibrationConfig(method="edges")

@@ -20,7 +20,7 @@ from sst_graph.initialization.global_search import (
 from sst_graph.initialization.label_agreement import CELLS, LabelledPoints, SearchFrame, States
 from sst_graph.sampling import evenly_spread
 from sst_graph.stepwise import run_to_end
-from sst_graph.types import Calibration, SemanticClass
+from sst_graph.types import Calibration, Guess, SemanticClass
 
 _MIN_RATIO = 0.9
 """Least score of a result as a fraction of the best one found around it: below 1, because errors of the
@@ -74,7 +74,7 @@ def search_again(
     own = evenly_spread([frame for frame in frames if frame.pair.drive == richest], FRAMES)
     chosen = [_search_frame(frame, result) for frame in own]
     camera = drives[richest].camera
-    problem = SearchProblem(chosen, camera, classes, result.cTl, result.time_offset_s, config)
+    problem = SearchProblem(chosen, camera, classes, Guess(*result), config)
     best = run_to_end(search_steps(problem, FINE))[0]
     rng = np.random.default_rng(config.seed)
     points = LabelledPoints.sampled(chosen, camera, classes, POINTS_PER_CLASS, rng)

@@ -23,7 +23,7 @@ from sst_graph.assumptions import ASSUMPTIONS, Assumption, named_sigmas
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.covariance.broken_assumptions import Evidence, considered_sigmas
 from sst_graph.covariance.cluster_robust import RobustCovariance, covariance_of, robust_covariance
-from sst_graph.covariance.considered import AssumptionConfig, Considered, considered_by_matches
+from sst_graph.covariance.considered import AssumptionConfig, Considered
 from sst_graph.covariance.error_model import fit_error_model
 from sst_graph.covariance.match_table import MatchTable, match_table
 from sst_graph.errors import EstimationError
@@ -109,36 +109,18 @@ class SolvedProblem:
         return solve_joint(replace(self.problem.joint(), config=free, centre=centre), start, kernels_px)
 
 
-@dataclass(frozen=True)
-class ExaminedAssumptions:
-    """The assumptions of a joint estimate: tests against the data, and what they add to the covariance.
+def examine_assumptions(
+    problem: CalibrationProblem, estimate: JointEstimate
+) -> tuple[tuple[ParameterTest, ...], Considered]:
+    """Test the assumptions against the data, and consider in the covariance what the data leave open.
 
-    Attributes:
-        findings: of the tests, the most contradicted first.
-        considered: what the assumptions add to the covariance, the tests' results included.
+    Returns:
+        The tests, the most contradicted first, and what the assumptions add to the covariance.
     """
-
-    findings: tuple[ParameterTest, ...]
-    considered: Considered
-
-    @property
-    def reasons(self) -> tuple[str, ...]:
-        """A sentence where the data contradict an assumption."""
-        return contradiction_sentence(self.findings)
-
-    def report(self) -> dict[str, Any]:
-        """As :func:`assumption_report`."""
-        return assumption_report(self.considered, self.findings)
-
-
-def examine_assumptions(problem: CalibrationProblem, estimate: JointEstimate) -> ExaminedAssumptions:
-    """Test the assumptions against the data, and consider in the covariance what the data leave open."""
-    config, solution = problem.config.assumptions, estimate.solution
-    findings = check_assumptions(SolvedProblem(problem, solution), config)
-    considered = considered_by_matches(
-        estimate.robust, solution.pairs, solution.values, solution.state, config
-    )
-    return ExaminedAssumptions(findings, with_test_results(considered, findings))
+    config = problem.config.assumptions
+    findings = check_assumptions(SolvedProblem(problem, estimate.solution), config)
+    considered = estimate.considered(config)
+    return findings, with_test_results(considered, findings)
 
 
 def check_assumptions(problem: SolvedProblem, config: AssumptionConfig) -> tuple[ParameterTest, ...]:
@@ -184,7 +166,7 @@ class LinearProblem:
         solution = problem.solve_with(names, start, _ALL_FREE_KERNELS_PX, len(_ALL_FREE_KERNELS_PX))
         graph, at, pairs = solution.graph, solution.values, solution.pairs
         unknowns = Unknowns.of(solution.state, pairs)
-        table = match_table(graph, at, pairs, solution.matched_at, problem.objects, unknowns)
+        table = match_table(graph, at, pairs, solution.frozen.state, problem.objects, unknowns)
         information = scaled_inverse(marginal_covariance(graph, at, unknowns))
         state = state_from(at, solution.state, pairs)
         return cls(table, unknowns, information, {name: state.nuisances[name] for name in names}, state)

@@ -1,4 +1,4 @@
-"""The paper's method and other baselines as methods of ``calibrate``."""
+"""The paper's method and the other baselines as methods of ``calibrate``."""
 
 from __future__ import annotations
 
@@ -7,47 +7,22 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from sst_graph.baselines.second_search import search_again
-from sst_graph.baselines.semalign import solve_semalign
-from sst_graph.baselines.sst_calib import NearestSolution, PaperProblem, solve_paper, solve_static
+from sst_graph.baselines.sst_calib import NearestSolution, PaperProblem
 from sst_graph.batch.config import CalibrationConfig
-from sst_graph.batch.method_estimate import Guess, MethodEstimate
+from sst_graph.batch.method_estimate import MethodEstimate
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import EstimationError
-from sst_graph.types import Calibration
+from sst_graph.types import Calibration, Guess
 
 
-def paper_method(
-    drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
-) -> MethodEstimate:
-    """SST-Calib, static and joint stage."""
-    return _checked(solve_paper, _problem(drives, config, progress), guess, config)
-
-
-def static_method(
-    drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
-) -> MethodEstimate:
-    """SST-Calib's static stage alone."""
-    return _checked(solve_static, _problem(drives, config, progress), guess, config)
-
-
-def semalign_method(
-    drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
-) -> MethodEstimate:
-    """SemAlign."""
-    return _checked(solve_semalign, _problem(drives, config, progress), guess, config)
-
-
-def _problem(drives: Sequence[Drive], config: CalibrationConfig, progress: Progress | None) -> PaperProblem:
-    return PaperProblem(drives, config.classes, config.paper, progress)
-
-
-def _checked(
+def baseline_method(
     solve: Callable[[PaperProblem, Calibration], NearestSolution],
-    problem: PaperProblem,
+    drives: Sequence[Drive],
     guess: Guess,
     config: CalibrationConfig,
+    progress: Progress | None,
 ) -> MethodEstimate:
-    """The solution, with reasons against it where a second search finds a better pose.
+    """A baseline's solution, with reasons against it where a second search finds a better pose.
 
     Raises:
         EstimationError: no guess, or nothing to solve.
@@ -55,9 +30,9 @@ def _checked(
     if guess.cTl is None:
         raise EstimationError(f"method {config.method} needs a guess to start from: it has no search")
     start = Calibration(guess.cTl, guess.time_offset_s)
-    solution = solve(problem, start)
+    solution = solve(PaperProblem(drives, config.classes, config.paper, progress), start)
     at, step = solution.calibration, solution.remaining_step
-    second = search_again(solution.frames, problem.drives, config.classes, start, at, config.search)
+    second = search_again(solution.frames, drives, config.classes, start, at, config.search)
     return MethodEstimate(
         at.cTl,
         at.time_offset_s,

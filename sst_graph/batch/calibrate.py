@@ -5,16 +5,19 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import gtsam
 
-from sst_graph.batch.assumption_tests import examine_assumptions
-from sst_graph.batch.baselines import paper_method, semalign_method, static_method
+from sst_graph.baselines.semalign import solve_semalign
+from sst_graph.baselines.sst_calib import solve_paper, solve_static
+from sst_graph.batch.assumption_tests import assumption_report, contradiction_sentence, examine_assumptions
+from sst_graph.batch.baselines import baseline_method
 from sst_graph.batch.by_edges.both import both_method
 from sst_graph.batch.by_edges.choice import with_method_for, with_method_of
 from sst_graph.batch.by_edges.method import edges_method
 from sst_graph.batch.causes import with_causes
-from sst_graph.batch.config import CalibrationConfig, Method
+from sst_graph.batch.config import CalibrationConfig, Method, prepared_classes
 from sst_graph.batch.contradictions import find_contradictions
 from sst_graph.batch.joint_report import (
     fit_of,
@@ -24,7 +27,6 @@ from sst_graph.batch.joint_report import (
     unknown_motion_remarks,
 )
 from sst_graph.batch.method_estimate import (
-    Guess,
     MethodEstimate,
     drive_offsets,
     frames_used,
@@ -44,7 +46,7 @@ from sst_graph.drive.preparation import TRACK_INTERVAL_S, Drive, PrepareConfig, 
 from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.odometry.sweep import with_sweep
 from sst_graph.result import CalibrationResult
-from sst_graph.types import SemanticClass, Source
+from sst_graph.types import Guess, Source
 from sst_graph.validation import checked_guess
 
 
@@ -96,21 +98,13 @@ def prepare_drives(
     prepare = preparation_of(config)
     with_lower_edges = config.method in ("joint", "both") and config.lower_edges != "never"
     depth = config.method in _NEED_DEPTH
-    classes = prepared_classes(config)
     if config.method == "edges":
         sources = [GeometricallyLabelled(source) for source in sources]
     # One drive after the other, for the frames that the sweep is decided by are kept until they are read.
     return [
-        prepare_drive(source, classes, prepare, progress, depth, with_lower_edges)
+        prepare_drive(source, prepared_classes(config), prepare, progress, depth, with_lower_edges)
         for source in (with_sweep(source, config.decide_sweep) for source in sources)
     ]
-
-
-def prepared_classes(config: CalibrationConfig) -> tuple[SemanticClass, ...]:
-    """Classes that drives are prepared with: edges need objects of no class."""
-    if config.method == "edges":
-        return (SemanticClass.OBJECT,)
-    return (*config.classes, SemanticClass.OBJECT) if config.method == "both" else config.classes
 
 
 def preparation_of(config: CalibrationConfig) -> PrepareConfig:
@@ -194,9 +188,9 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
     labels_alone = JointEstimate.of(solutions[0], problem.objects)
     motion = with_motion(problem, labels_alone, contradictions.stretches)
     # 6. Assumptions: tested against the data, considered in the covariance.
-    assumptions = examine_assumptions(problem, motion.estimate)
+    tests, considered = examine_assumptions(problem, motion.estimate)
     # 7. Total covariance: with unmeasured motion and undecided sweeps, which no match shows.
-    total = total_covariance(problem, motion.estimate, assumptions.considered)
+    total = total_covariance(problem, motion.estimate, considered)
     # 8. How it fits the labels, point by point.
     fit = fit_of(problem, (start_solution, lower.solutions[0], motion.estimate.solution), total.covariance)
     # 9. The estimate, and why it may be wrong.
@@ -207,38 +201,35 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
         solution.state.time_offsets_s[0],
         total.covariance,
         frames_used(drives, solution),
-        (*assumptions.reasons, *wrong, *contradictions.sentences, *motion.reasons, *total.reasons),
+        (*contradiction_sentence(tests), *wrong, *contradictions.sentences, *motion.reasons, *total.reasons),
         (*unknown_motion_remarks(drives), *motion.remarks),
         motion.estimate.by_static_objects[:7, :7],
         drive_offsets(drives, solution.state, unknowns),
         total.by_drive,
         agreement
         | {"start_score": start.score, "contradictions": contradictions.diagnostics}
-        | {"motion": motion.diagnostics, "assumptions": assumptions.report(), BUDGET: total.budget}
+        | {
+            "motion": motion.diagnostics,
+            "assumptions": assumption_report(considered, tests),
+            BUDGET: total.budget,
+        }
         | joint_diagnostics(problem, motion.estimate, lower),
-        JointOutcome(problem, motion.estimate, assumptions.considered),
+        JointOutcome(problem, motion.estimate, considered),
         fit,
         total.by_sweeps,
         total.reasons,
     )
 
 
-def labels_and_edges(
-    drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
-) -> MethodEstimate:
-    """The joint method where frames have labels, edges in the others."""
-    return both_method(joint_method, drives, guess, config, progress)
-
-
 _Method = Callable[[Sequence[Drive], Guess, CalibrationConfig, Progress | None], MethodEstimate]
 _METHODS: dict[Method, _Method] = {
     "joint": joint_method,
-    "paper": paper_method,
-    "static": static_method,
-    "semalign": semalign_method,
+    "paper": partial(baseline_method, solve_paper),
+    "static": partial(baseline_method, solve_static),
+    "semalign": partial(baseline_method, solve_semalign),
     "motion": motion_method,
     "edges": edges_method,
-    "both": labels_and_edges,
+    "both": partial(both_method, joint_method),
 }
 _NEED_IMAGE_TRACKS = ("paper", "static", "motion", "edges", "both")
 """Methods whose camera velocity comes from visual odometry."""

@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import gtsam
-
 from sst_graph.batch.config import CalibrationConfig
-from sst_graph.batch.method_estimate import Guess
 from sst_graph.diagnosis import Finding, Fit, Fitter, likely_causes, mirror, other_camera, preflight
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
-from sst_graph.graph.building import Tracks
+from sst_graph.graph.matching import Tracks
 from sst_graph.graph.outer_loop import (
     NARROW_KERNELS_PX,
     JointProblem,
@@ -21,10 +18,11 @@ from sst_graph.graph.outer_loop import (
     solve_joint,
 )
 from sst_graph.graph.state import State
-from sst_graph.initialization.candidates import StartProblem
+from sst_graph.initialization.candidates import StartProblem, prior_centre
 from sst_graph.initialization.selection import select_start_steps
 from sst_graph.result import CalibrationResult
 from sst_graph.stepwise import run_to_end
+from sst_graph.types import Guess
 
 _AGREED = 0.3
 """Share of the outlines that meet, times that of close matches, above which no mirror is looked for: mirrored
@@ -57,30 +55,30 @@ def _suspected(
     """What explains a result that is missing, may be wrong, or agrees with few of the labels."""
     fit = fit_labels(config)
     if not result.frames_used or result.status == "not_converged":
-        return likely_causes(drives, guess.cTl, guess.time_offset_s, fit)
+        return likely_causes(drives, guess, fit)
     explained, concentration = (float(result.diagnostics[key]) for key in ("explained", "concentration"))
     if explained * concentration < _AGREED:
         solved = Fit(result.T_camera_lidar, result.time_offset_s, explained, concentration)
-        return mirror(drives, guess.cTl, guess.time_offset_s, fit, solved)
+        return mirror(drives, guess, fit, solved)
     return ()
 
 
 def fit_labels(config: CalibrationConfig) -> Fitter:
     """Search and short solution on a few scans of one drive, with a calibration's own settings."""
 
-    def fit(drive: Drive, guess: gtsam.Pose3 | None, time_offset_s: float) -> Fit | None:
+    def fit(drive: Drive, guess: Guess) -> Fit | None:
         step = -(-len(drive.scans) // _SCANS)
         tracks = Tracks([drive])
         few = [replace(drive, scans=drive.scans[::step])]
         joint = replace(config.joint, max_outer=len(NARROW_KERNELS_PX))
-        search = StartProblem(few, tracks, config.classes, guess, time_offset_s)
+        search = StartProblem(few, tracks, config.classes, guess)
         try:
             selection = run_to_end(
                 select_start_steps(search, joint.graph, config.search, _SCANS, _CANDIDATES)
             )
             cTl, found_s = selection.starts[0]
             start = State(cTl, (found_s,))
-            problem = JointProblem(few, tracks, joint, search.centre(start))
+            problem = JointProblem(few, tracks, joint, prior_centre(guess, start))
             solution = solve_joint(problem, start, NARROW_KERNELS_PX)
         except EstimationError:
             return None

@@ -12,7 +12,7 @@ from sst_graph.covariance.observability import ObservabilityConfig
 from sst_graph.covariance.unknown_motion import UnknownMotionConfig
 from sst_graph.drive.preparation import PrepareConfig
 from sst_graph.features.lidar_edges import MAX_RANGE_M
-from sst_graph.graph.building import GraphConfig
+from sst_graph.graph.matching import GraphConfig
 from sst_graph.graph.outer_loop import JointConfig
 from sst_graph.initialization.global_search import SearchConfig
 from sst_graph.odometry.lidar import LidarOdometryConfig
@@ -132,3 +132,10 @@ class CalibrationConfig(Settings):
     def estimating(self) -> CalibrationConfig:
         """The same with a variable in method joint's graph for each assumption that is to be estimated."""
         return replace(self, noise=replace(self.noise, estimate=self.assumptions.estimate))
+
+
+def prepared_classes(config: CalibrationConfig) -> tuple[SemanticClass, ...]:
+    """Classes that drives are prepared with: edges need objects of no class."""
+    if config.method == "edges":
+        return (SemanticClass.OBJECT,)
+    return (*config.classes, SemanticClass.OBJECT) if config.method == "both" else config.classes

@@ -15,7 +15,7 @@ from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.drive.preparation import Drive
 from sst_graph.fit import Fit, Profile
 from sst_graph.graph.outer_loop import JointSolution, agreement, concentration, explained, poor_fit
-from sst_graph.hand_eye.solution import difference
+from sst_graph.graph.state import difference
 from sst_graph.initialization.selection import ALTERNATIVE_RATIO, REACH
 from sst_graph.inspect.frame_gains import frame_gains
 from sst_graph.inspect.frame_information import KEY as FRAME_INFORMATION

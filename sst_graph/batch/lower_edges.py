@@ -15,8 +15,7 @@ from sst_graph.association.edge_matching import BOTTOM
 from sst_graph.batch.config import UseLowerEdges
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.factors.robust import RobustKernel
-from sst_graph.graph.building import Tracks
-from sst_graph.graph.matching import edges_of, match_all
+from sst_graph.graph.matching import Tracks, edges_of, match_all
 from sst_graph.graph.outer_loop import (
     CONCENTRATION_SCALES,
     KERNELS_PX,
@@ -69,22 +68,16 @@ def with_lower_edges(
         EstimationError: too few matches at any step.
     """
     solutions, joint = [solution for solution, _ in finals], problem.config
-    chosen, concentration = agreed_lower_edges(problem.drives, problem.tracks, solutions[0].state, joint, use)
+    if use == "never":
+        return WithLowerEdges(solutions, joint)
+    support = lower_edge_support(problem.drives, problem.tracks, solutions[0].state, joint)
+    chosen, concentration = support.agreed(use)
     if not chosen:
         return WithLowerEdges(solutions, joint, concentration)
     joint = replace(joint, graph=replace(joint.graph, lower_edges=chosen))
     starts = [(one.state, centre) for one, centre in finals]
     fuller = solve_all(replace(problem, config=joint), starts, _KERNELS_PX, progress)
     return WithLowerEdges(fuller, joint, concentration)
-
-
-def agreed_lower_edges(
-    drives: Sequence[Drive], tracks: Tracks, state: State, joint: JointConfig, use: UseLowerEdges
-) -> tuple[tuple[SemanticClass, ...], dict[SemanticClass, float]]:
-    """Classes whose edges towards the ground are to be matched, and the concentration that says so."""
-    if use == "never":
-        return (), {}
-    return lower_edge_support(drives, tracks, state, joint).agreed(use)
 
 
 @dataclass(frozen=True)

@@ -30,21 +30,16 @@ from sst_graph.graph.outer_loop import JointSolution
 from sst_graph.graph.state import State
 from sst_graph.odometry.sweep import SWEEP_KEY
 from sst_graph.result import CalibrationResult, DriveOffset, FrameId, Status, WeakDirection
+from sst_graph.types import Guess
 
 if TYPE_CHECKING:
     from sst_graph.batch.problem import JointOutcome
 
 FloatArray = NDArray[np.float64]
 
+UNKNOWN_SIGMAS = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
+"""(7,) deviations of what is not known at all [rad, m, s]."""
 PACKAGES = ("sst-graph", "gtsam", "numpy", "scipy", "small_gicp")
-
-
-@dataclass(frozen=True)
-class Guess:
-    """Initial guess: an extrinsic, or None, and a time offset [s]."""
-
-    cTl: gtsam.Pose3 | None
-    time_offset_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -192,11 +187,10 @@ def guess_as_result(
     drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, reason: str
 ) -> CalibrationResult:
     """The result where no estimate could be made: the guess, with large sigmas."""
-    sigmas = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
     return CalibrationResult(
         T_camera_lidar=guess.cTl or gtsam.Pose3(),
         time_offset_s=guess.time_offset_s,
-        covariance=np.diag(sigmas**2),
+        covariance=np.diag(UNKNOWN_SIGMAS**2),
         status="unobservable",
         camera=drives[0].camera,
         reasons=(reason,),

@@ -19,16 +19,18 @@ from sst_graph.covariance.observability import weak_directions
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
 from sst_graph.graph.outer_loop import KERNELS_PX, solve_joint
-from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
-from sst_graph.hand_eye.solution import difference, solve_motion
+from sst_graph.graph.state import EXTRINSIC, State, difference, time_offset_key
+from sst_graph.hand_eye.solution import solve_motion
+from sst_graph.types import Guess
 
 FloatArray = NDArray[np.float64]
 
 MAX_DISAGREEMENT_CHI2 = 40.0
 """Chi-squared, of 7, of the difference between labels and motion up to which the motion is used: both
 covariances may be too small by a factor of 1.7 for an agreement that a 95 % quantile (14.07) would accept."""
-_UNLIKELY_CHI2 = 14.07
-"""95 % quantile of chi-squared with 7 degrees of freedom."""
+UNLIKELY_CHI2 = 14.07
+"""95 % quantile of chi-squared with 7 degrees of freedom: beyond it a covariance grows by Birge's ratio,
+squared."""
 
 
 @dataclass(frozen=True)
@@ -90,9 +92,8 @@ def fuse_motion(
     config, state, covariance = problem.config, labels.solution.state, labels.covariance[:7, :7]
     try:
         reach_s = config.search.time_offset_s
-        motion = solve_motion(problem.drives, state.cTl, state.time_offsets_s[0], reach_s, problem.progress)[
-            0
-        ]
+        guess = Guess(state.cTl, state.time_offsets_s[0])
+        motion = solve_motion(problem.drives, guess, reach_s, problem.progress)[0]
     except EstimationError as error:
         return WithMotion(labels, diagnostics={"left_out": str(error)})
     # 2. Do they agree?
@@ -117,7 +118,7 @@ def fuse_motion(
     joint = replace(problem.joint(), centre=problem.prior_centre(state), prior=factor)
     solution = solve_joint(joint, state, KERNELS_PX[-1:], problem.progress)
     # 4. The covariance; Birge's ratio, squared, where labels and motion differ by more than theirs allow.
-    inflation = chi2 / len(step) if chi2 > _UNLIKELY_CHI2 else 1.0
+    inflation = chi2 / len(step) if chi2 > UNLIKELY_CHI2 else 1.0
     fused = JointEstimate.of(solution, problem.objects)
     static = fused.by_static_objects if config.use_motion == "always" else labels.by_static_objects
     fused = replace(fused, covariance=inflation * fused.covariance, by_static_objects=static)

@@ -7,11 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from sst_graph.batch.config import CalibrationConfig
-from sst_graph.batch.method_estimate import Guess, MethodEstimate
+from sst_graph.batch.method_estimate import MethodEstimate
 from sst_graph.drive.preparation import Drive, Progress
-from sst_graph.hand_eye.solution import MotionSolution, alternative, difference, solve_motion
+from sst_graph.graph.state import difference
+from sst_graph.hand_eye.solution import MotionSolution, alternative, solve_motion
 from sst_graph.inspect.gained import KEY, pair_gains, to_document
 from sst_graph.result import FrameId
+from sst_graph.types import Guess
 
 
 def motion_method(
@@ -22,7 +24,7 @@ def motion_method(
     Raises:
         EstimationError: too few consecutive frames with known motion.
     """
-    solutions = solve_motion(drives, guess.cTl, guess.time_offset_s, config.search.time_offset_s, progress)
+    solutions = solve_motion(drives, guess, config.search.time_offset_s, progress)
     best = solutions[0]
     cameras = best.terms.pairs.cameras
     frames = tuple(FrameId(drives[camera.drive].name, camera.image) for camera in cameras)

@@ -8,19 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.batch.problem import CalibrationProblem
-from sst_graph.covariance.cluster_robust import robust_covariance
-from sst_graph.covariance.considered import considered_by_matches
+from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.covariance.contradiction import PartEstimate
-from sst_graph.covariance.static_objects import static_covariance
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
 from sst_graph.factors.robust import RobustKernel
-from sst_graph.graph.building import Tracks
-from sst_graph.graph.matching import edges_of, match_all
+from sst_graph.graph.matching import Tracks, edges_of, match_all
 from sst_graph.graph.outer_loop import JointProblem, JointSolution, robust_weights, solve_joint
-from sst_graph.graph.state import State
-from sst_graph.hand_eye.solution import difference
+from sst_graph.graph.state import State, difference
 from sst_graph.objects.tracks import tracks_of_scans
 
 FloatArray = NDArray[np.float64]
@@ -100,18 +95,13 @@ class PartSolver:
         return State(self.reference.cTl, (self.reference.time_offset_s(part.drive),))
 
     def _step(self, part: Part, solution: JointSolution) -> PartEstimate:
-        state = solution.state
         objects = [tracks_of_scans(self.problem.objects[part.drive], part.scans)]
-        robust = robust_covariance(solution.graph, solution.values, solution.pairs, state, objects)
-        assumptions = self.problem.config.assumptions
-        extra = considered_by_matches(robust, solution.pairs, solution.values, state, assumptions).covariance(
-            7
-        )
+        estimate = JointEstimate.of(solution, objects)
+        extra = estimate.considered(self.problem.config.assumptions).covariance(7)
         # By static objects alone: a vehicle that brakes looks like another time offset.
-        covariance = static_covariance(robust, solution.pairs)[:7, :7] + extra
-        weights = np.bincount(robust.table.sides, robust.table.root_weights**2)
-        clusters = float(weights.sum() ** 2 / max(float(weights @ weights), 1e-12))
-        return PartEstimate(difference(self.reference_of(part), state), covariance, clusters)
+        covariance = estimate.by_static_objects[:7, :7] + extra
+        step = difference(self.reference_of(part), solution.state)
+        return PartEstimate(step, covariance, estimate.robust.table.clusters)
 
     def _data(self, part: Part) -> tuple[Drive, Tracks]:
         """The drive and its tracks, of the part's scans alone."""

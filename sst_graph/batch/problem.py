@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.lower_edges import WithLowerEdges, with_lower_edges
-from sst_graph.batch.method_estimate import Guess
 from sst_graph.covariance.cluster_robust import RobustCovariance, robust_covariance
-from sst_graph.covariance.considered import Considered
+from sst_graph.covariance.considered import AssumptionConfig, Considered, considered_by_matches
 from sst_graph.covariance.static_objects import static_covariance
 from sst_graph.drive.preparation import Drive, Progress
-from sst_graph.graph.building import GraphConfig, Tracks
+from sst_graph.graph.matching import GraphConfig, Tracks
 from sst_graph.graph.outer_loop import (
     KERNELS_PX,
     NARROW_KERNELS_PX,
@@ -24,10 +23,11 @@ from sst_graph.graph.outer_loop import (
     solve_all,
 )
 from sst_graph.graph.state import State
-from sst_graph.initialization.candidates import StartProblem
+from sst_graph.initialization.candidates import StartProblem, prior_centre
 from sst_graph.initialization.selection import Selection, alternatives, select_start_steps
 from sst_graph.objects.tracks import ObjectId, object_tracks
 from sst_graph.stepwise import run_to_end
+from sst_graph.types import Guess
 
 FloatArray = NDArray[np.float64]
 
@@ -70,7 +70,7 @@ class CalibrationProblem:
 
     def prior_centre(self, state: State) -> State:
         """What the weak priors of a solution from or at a state are centred on."""
-        return self._start_problem().centre(state)
+        return prior_centre(self.guess, state)
 
     def joint(self) -> JointProblem:
         """The graph's part of the problem."""
@@ -82,7 +82,9 @@ class CalibrationProblem:
         Raises:
             EstimationError: no candidate leads anywhere.
         """
-        return run_to_end(select_start_steps(self._start_problem(), self.config.noise, self.config.search))
+        # Without the tracks of objects.
+        problem = StartProblem(self.drives, Tracks(self.drives), self.config.classes, self.guess)
+        return run_to_end(select_start_steps(problem, self.config.noise, self.config.search))
 
     def with_noise(self, noise: GraphConfig) -> CalibrationProblem:
         """The problem with another noise of the joint graph."""
@@ -109,13 +111,6 @@ class CalibrationProblem:
         centred = [(start, self.prior_centre(start)) for start in starts]
         return solve_all(self.joint(), centred, kernels_px, self.progress)
 
-    def _start_problem(self) -> StartProblem:
-        """What a start is searched for, without the tracks of objects."""
-        guess = self.guess
-        return StartProblem(
-            self.drives, Tracks(self.drives), self.config.classes, guess.cTl, guess.time_offset_s
-        )
-
 
 @dataclass(frozen=True)
 class JointEstimate:
@@ -138,6 +133,11 @@ class JointEstimate:
         """The solution with the covariance of its last matches."""
         robust = robust_covariance(solution.graph, solution.values, solution.pairs, solution.state, objects)
         return cls(solution, robust, robust.matrix, static_covariance(robust, solution.pairs))
+
+    def considered(self, config: AssumptionConfig) -> Considered:
+        """What the assumptions that are not estimated add to the covariance."""
+        last = self.solution
+        return considered_by_matches(self.robust, last.pairs, last.values, last.state, config)
 
 
 @dataclass(frozen=True)

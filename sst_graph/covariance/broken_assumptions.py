@@ -47,18 +47,6 @@ class Evidence:
     span: float
     prevalence: float
 
-    def broken(self) -> tuple[float, float]:
-        """The Bayes factor for a broken assumption, and the mean square of its parameter if it is."""
-        taus = np.geomspace(self.prior, self.span, _SCALES)
-        logs = _log_normal(self.estimate, self.deviation**2 + taus**2)
-        logs = logs - _log_normal(self.estimate, np.array([self.deviation**2 + self.prior**2]))
-        most = float(logs.max())
-        shares = np.exp(logs - most)
-        variances = 1.0 / (self.deviation**-2.0 + taus**-2.0)
-        squares = variances * (1.0 + variances * self.estimate**2 / self.deviation**4)
-        factor = float(np.exp(min(most, _MOST_LOG)) * shares.mean())
-        return factor, float((shares * squares).sum() / shares.sum())
-
 
 _MOST_LOG = 500.0
 """Largest logarithm of a Bayes factor, so that its exponential is finite."""
@@ -71,8 +59,20 @@ def _log_normal(value: float, variances: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=64)
 def _broken(evidence: Evidence) -> tuple[float, float]:
-    """:meth:`Evidence.broken`: between two tests a tracker asks for the same several times a frame."""
-    return evidence.broken()
+    """The Bayes factor for a broken assumption, and the mean square of its parameter if it is.
+
+    Between two tests a tracker asks for the same several times a frame.
+    """
+    estimate, deviation = evidence.estimate, evidence.deviation
+    taus = np.geomspace(evidence.prior, evidence.span, _SCALES)
+    logs = _log_normal(estimate, deviation**2 + taus**2)
+    logs = logs - _log_normal(estimate, np.array([deviation**2 + evidence.prior**2]))
+    most = float(logs.max())
+    shares = np.exp(logs - most)
+    variances = 1.0 / (deviation**-2.0 + taus**-2.0)
+    squares = variances * (1.0 + variances * estimate**2 / deviation**4)
+    factor = float(np.exp(min(most, _MOST_LOG)) * shares.mean())
+    return factor, float((shares * squares).sum() / shares.sum())
 
 
 def considered_sigmas(evidence: Mapping[str, Evidence]) -> dict[str, float]:

@@ -27,8 +27,8 @@ from sst_graph.covariance.error_model import ErrorModel, fit_error_model
 from sst_graph.covariance.jackknife import ObjectSpread, composed, steps_without
 from sst_graph.covariance.match_table import MatchTable, match_table
 from sst_graph.covariance.sums import ScoreSums
-from sst_graph.graph.building import PairMatches
 from sst_graph.graph.elimination import Unknowns, marginal_covariance
+from sst_graph.graph.matching import PairMatches
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import ObjectId
 
@@ -80,9 +80,8 @@ def covariance_of(
     """
     scores = table.scores if scores is None else scores
     covariance = bread + bread @ scores.excess(model) @ bread
-    steps = steps_without_objects(table, bread)
-    weights = np.asarray(np.bincount(table.objects, table.root_weights**2), np.float64)
-    covariance = composed(covariance, ObjectSpread.of(steps, weights), table.weight_curvature_ratio)
+    spread = ObjectSpread.of(steps_without_objects(table, bread), table.object_weights)
+    covariance = composed(covariance, spread, table.weight_curvature_ratio)
     return np.asarray(0.5 * (covariance + covariance.T))
 
 

@@ -22,8 +22,9 @@ from sst_graph.assumptions import ASSUMPTIONS, held_at_zero, named_sigmas
 from sst_graph.config import Settings, setting
 from sst_graph.covariance.cluster_robust import RobustCovariance
 from sst_graph.covariance.match_table import MatchTable
-from sst_graph.graph.building import GraphConfig, PairMatches, joint_graph
+from sst_graph.graph.building import joint_graph
 from sst_graph.graph.elimination import marginal_covariance
+from sst_graph.graph.matching import GraphConfig, PairMatches
 from sst_graph.graph.nuisances import residual_columns
 from sst_graph.graph.state import State, twist_key
 

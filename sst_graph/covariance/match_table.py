@@ -18,8 +18,9 @@ from sst_graph.covariance.jackknife import curvature_ratio
 from sst_graph.covariance.sums import ScoreSums
 from sst_graph.factors.alignment import weighted_residuals
 from sst_graph.factors.robust import RobustKernel
-from sst_graph.graph.building import PairMatches, bias_groups, state_from
+from sst_graph.graph.building import bias_groups, state_from
 from sst_graph.graph.elimination import Unknowns, twist_responses
+from sst_graph.graph.matching import PairMatches
 from sst_graph.graph.state import State, nuisance_key, time_offset_key, twist_key
 from sst_graph.objects.tracks import ObjectId
 from sst_graph.types import SemanticClass
@@ -54,6 +55,17 @@ class MatchTable:
     def objects(self) -> IntArray:
         """(m,) number of the object over all frames, from 0 on."""
         return np.unique(self.sides // SIDES, return_inverse=True)[1].reshape(-1)
+
+    @property
+    def object_weights(self) -> FloatArray:
+        """By object, the sum of the robust weights of its matches."""
+        return np.asarray(np.bincount(self.objects, self.root_weights**2), np.float64)
+
+    @property
+    def clusters(self) -> float:
+        """How many sides of equal weight would weigh as unevenly as these: (sum w)^2 / sum w^2."""
+        weights = np.bincount(self.sides, self.root_weights**2)
+        return float(weights.sum() ** 2 / max(float(weights @ weights), 1e-12))
 
     def take(self, index: IntArray) -> MatchTable:
         """Some of the matches, by position."""

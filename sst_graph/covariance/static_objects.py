@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sst_graph.covariance.cluster_robust import RobustCovariance, covariance_of
 from sst_graph.covariance.sums import gram
-from sst_graph.graph.building import PairMatches
+from sst_graph.graph.matching import PairMatches
 
 FloatArray = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.config import Settings, setting
-from sst_graph.graph.building import PairMatches
+from sst_graph.graph.matching import PairMatches
 from sst_graph.graph.state import State
 
 FloatArray = NDArray[np.float64]

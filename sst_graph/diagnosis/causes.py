@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import gtsam
 
@@ -12,7 +12,7 @@ from sst_graph.diagnosis.fit import LEAST_QUALITY, WELL, Fit, Fitter
 from sst_graph.diagnosis.hypotheses import best_hypothesis, mirrored
 from sst_graph.diagnosis.poses import wrong_start
 from sst_graph.drive.preparation import Drive
-from sst_graph.types import SemanticClass
+from sst_graph.types import Guess, SemanticClass
 
 
 def preflight(
@@ -24,12 +24,6 @@ def preflight(
         guess: where the calibration starts, or None.
         classes: that are aligned; empty where labels are not used.
     """
-    return tuple(dict.fromkeys(_preflight(drives, guess, classes)))
-
-
-def _preflight(
-    drives: Sequence[Drive], guess: gtsam.Pose3 | None, classes: Sequence[SemanticClass]
-) -> Iterator[Finding]:
     found = [units.start_unit(guess)]
     for drive in drives:
         found += [cameras.image_size(drive.camera), clocks.stamps(drive), clocks.two_clocks(drive)]
@@ -39,44 +33,40 @@ def _preflight(
     if classes:
         found.append(labels.searched_classes(drives, classes))
         found.append(labels.shifted_masks(labels.shift(drives)))
-    yield from (finding for finding in found if finding is not None)
+    return tuple(dict.fromkeys(finding for finding in found if finding is not None))
 
 
-def likely_causes(
-    drives: Sequence[Drive], guess: gtsam.Pose3 | None, time_offset_s: float, fit: Fitter
-) -> tuple[Finding, ...]:
+def likely_causes(drives: Sequence[Drive], guess: Guess, fit: Fitter) -> tuple[Finding, ...]:
     """Why the labels do not agree, for a result that is missing or may be wrong; empty where they do agree.
 
     Args:
-        guess, time_offset_s: where the calibration started.
+        guess: where the calibration started.
         fit: how well labels agree, by the calibration's own search.
     """
     drive = max(drives, key=lambda one: len(one.scans))
-    certain = labels.foreign_masks(labels.shift(drives)) or units.axes(drive, guess)
+    certain = labels.foreign_masks(labels.shift(drives)) or units.axes(drive, guess.cTl)
     if certain is not None:
         return (certain,)
-    given = fit(drive, guess, time_offset_s)
+    given = fit(drive, guess)
     if given is not None and given.quality > WELL:
         return ()
-    cause = best_hypothesis(drive, guess, time_offset_s, fit, given)
-    if cause is None and guess is not None:
-        cause = wrong_start(guess, fit(drive, None, time_offset_s))
+    cause = best_hypothesis(drive, guess, fit, given)
+    if cause is None and guess.cTl is not None:
+        cause = wrong_start(guess.cTl, fit(drive, Guess(None, guess.time_offset_s)))
     if cause is None and (given is None or given.quality < LEAST_QUALITY):
         cause = _nothing_in_common(given)
     return () if cause is None else (cause,)
 
 
-def mirror(
-    drives: Sequence[Drive], guess: gtsam.Pose3 | None, time_offset_s: float, fit: Fitter, result: Fit
-) -> tuple[Finding, ...]:
+def mirror(drives: Sequence[Drive], guess: Guess, fit: Fitter, result: Fit) -> tuple[Finding, ...]:
     """Whether mirrored data would agree better, for a result without any other reason against it.
 
     Args:
         result: how well the labels agree in the result.
     """
     drive = max(drives, key=lambda one: len(one.scans))
-    around = result.cTl if guess is None else guess
-    cause = mirrored(drive, around, time_offset_s, fit, result, sideways=guess is not None)
+    around = Guess(guess.cTl or result.cTl, guess.time_offset_s)
+    cause = mirrored(drive, around, fit, result, sideways=guess.cTl is not None)
     return () if cause is None else (cause,)
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import gtsam
 
 from sst_graph.drive.preparation import Drive
+from sst_graph.types import Guess
 
 WELL = 0.4
 """Quality above which nothing else is tried: right data have 0.2 (hand-drawn labels, crowded street) to 0.6,
@@ -43,5 +44,5 @@ class Fit:
         return self.explained * self.concentration
 
 
-Fitter = Callable[[Drive, gtsam.Pose3 | None, float], Fit | None]
-"""Searches around a guess (None: anywhere) and a time offset [s]; None where nothing is found."""
+Fitter = Callable[[Drive, Guess], Fit | None]
+"""Searches around a guess; None where nothing is found."""

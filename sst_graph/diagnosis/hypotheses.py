@@ -26,6 +26,7 @@ from sst_graph.diagnosis.fit import (
 )
 from sst_graph.diagnosis.poses import start_finding
 from sst_graph.drive.preparation import Drive, ScanFeatures
+from sst_graph.types import Guess
 
 FloatArray = NDArray[np.float64]
 
@@ -37,15 +38,13 @@ class Hypothesis:
     Attributes:
         finding: the cause that it undoes; its evidence is written by the comparison.
         drive: with the change.
-        guess: to search around; None for anywhere.
-        time_offset_s: to search around [s].
+        guess: to search around.
         start: as it was given, where it is what was changed.
     """
 
     finding: Finding
     drive: Drive
-    guess: gtsam.Pose3 | None
-    time_offset_s: float
+    guess: Guess
     start: gtsam.Pose3 | None = None
 
 
@@ -57,28 +56,26 @@ _WINDOW_S = 0.9
 """Width of a window [s]: the search reaches half a second either way."""
 
 
-def best_hypothesis(
-    drive: Drive, guess: gtsam.Pose3 | None, time_offset_s: float, fit: Fitter, given: Fit | None
-) -> Finding | None:
+def best_hypothesis(drive: Drive, guess: Guess, fit: Fitter, given: Fit | None) -> Finding | None:
     """The change under which the labels agree, where they clearly do; None where none helps.
 
     All changes are compared, for a wrong one may fit well by chance; shifts in time only where none does.
     """
-    best = _best(hypotheses(drive, guess, time_offset_s), time_offset_s, fit, given)
+    best = _best(hypotheses(drive, guess), guess, fit, given)
     if best is None or best[0] <= WELL:
-        shifted = _best(_shifts(drive, guess, time_offset_s), time_offset_s, fit, given, enough=WELL)
+        shifted = _best(_shifts(drive, guess), guess, fit, given, enough=WELL)
         best = max((b for b in (best, shifted) if b is not None), key=lambda b: b[0], default=None)
     return None if best is None else best[1]
 
 
 def _best(
-    tried: Iterator[Hypothesis], time_offset_s: float, fit: Fitter, given: Fit | None, enough: float = np.inf
+    tried: Iterator[Hypothesis], guess: Guess, fit: Fitter, given: Fit | None, enough: float = np.inf
 ) -> tuple[float, Finding] | None:
     """Quality and cause of the best change that is accepted; none is tried after one of ``enough``."""
     base = Fit(gtsam.Pose3(), 0.0, 0.0, 0.0) if given is None else given
     best: tuple[float, Finding] | None = None
     for hypothesis in tried:
-        found = fit(hypothesis.drive, hypothesis.guess, hypothesis.time_offset_s)
+        found = fit(hypothesis.drive, hypothesis.guess)
         if found is None or found.concentration < LEAST_CONCENTRATION:
             continue
         if found.quality < max(LEAST_QUALITY, LEAST_GAIN * base.quality):
@@ -91,7 +88,7 @@ def _best(
                 f"undone, {100.0 * found.explained:.0f} % of the outlines meet; as given, {before:.0f} %"
             )
             finding = replace(hypothesis.finding, evidence=evidence)
-            if hypothesis.time_offset_s != time_offset_s:
+            if hypothesis.guess.time_offset_s != guess.time_offset_s:
                 finding = replace(finding, evidence=f"{evidence}, time offset {found.time_offset_s:+.2f} s")
             if hypothesis.start is not None:
                 finding = start_finding(hypothesis.start, found, finding)
@@ -101,7 +98,7 @@ def _best(
     return best
 
 
-def _shifts(drive: Drive, guess: gtsam.Pose3 | None, time_offset_s: float) -> Iterator[Hypothesis]:
+def _shifts(drive: Drive, guess: Guess) -> Iterator[Hypothesis]:
     """Time offsets on either side of what was searched, as far as the drive reaches."""
     period, length = drive.image_period_s, (drive.scan_stamps_ns[-1] - drive.scan_stamps_ns[0]) * 1e-9
     windows = min(_MOST_SHIFTS, int(_OVERLAP * length / _WINDOW_S))
@@ -113,12 +110,10 @@ def _shifts(drive: Drive, guess: gtsam.Pose3 | None, time_offset_s: float) -> It
                 "",
                 "compare the first frames of both sensors, or give --image-shift",
             )
-            yield Hypothesis(finding, drive, guess, time_offset_s + shift_s)
+            yield Hypothesis(finding, drive, Guess(guess.cTl, guess.time_offset_s + shift_s))
 
 
-def mirrored(
-    drive: Drive, guess: gtsam.Pose3, time_offset_s: float, fit: Fitter, given: Fit, sideways: bool
-) -> Finding | None:
+def mirrored(drive: Drive, guess: Guess, fit: Fitter, given: Fit, sideways: bool) -> Finding | None:
     """Clouds or pictures that are mirrored: the only mistake with which an estimate may still have the status
     ``ok``.
 
@@ -126,16 +121,16 @@ def mirrored(
         sideways: left and right only: with a given start, no estimate is ``ok`` where the cloud is also
             turned by 180 degrees.
     """
-    tried = itertools.islice(_mirrorings(drive, guess, time_offset_s), 1 if sideways else None)
-    best = _best(tried, time_offset_s, fit, given)
+    tried = itertools.islice(_mirrorings(drive, guess), 1 if sideways else None)
+    best = _best(tried, guess, fit, given)
     return None if best is None else best[1]
 
 
-def hypotheses(drive: Drive, guess: gtsam.Pose3 | None, time_offset_s: float) -> Iterator[Hypothesis]:
+def hypotheses(drive: Drive, guess: Guess) -> Iterator[Hypothesis]:
     """The common mistakes, each undone."""
-    for name, check, start in _starts(guess):
-        yield Hypothesis(Finding(name, "", check), drive, start, time_offset_s, guess)
-    yield from _mirrorings(drive, guess, time_offset_s)
+    for name, check, start in _starts(guess.cTl):
+        yield Hypothesis(Finding(name, "", check), drive, replace(guess, cTl=start), guess.cTl)
+    yield from _mirrorings(drive, guess)
     for factor, name in ((0.5, "half"), (2.0, "twice")):
         camera = drive.camera
         focal = replace(camera, fx=camera.fx / factor, fy=camera.fy / factor)
@@ -144,14 +139,14 @@ def hypotheses(drive: Drive, guess: gtsam.Pose3 | None, time_offset_s: float) ->
             "",
             f"compare fx = {camera.fx:.0f} px with the camera that took the pictures",
         )
-        yield Hypothesis(finding, replace(drive, camera=focal), guess, time_offset_s)
+        yield Hypothesis(finding, replace(drive, camera=focal), guess)
 
 
-def _mirrorings(drive: Drive, guess: gtsam.Pose3 | None, time_offset_s: float) -> Iterator[Hypothesis]:
+def _mirrorings(drive: Drive, guess: Guess) -> Iterator[Hypothesis]:
     changed = with_points(drive, np.diag([1.0, -1.0, 1.0]))
-    for name, turned in _mirrored_starts(guess):
+    for name, turned in _mirrored_starts(guess.cTl):
         check = "look at a cloud from above and at its picture: is what is left in one left in the other?"
-        yield Hypothesis(Finding(name, "", check), changed, turned, time_offset_s)
+        yield Hypothesis(Finding(name, "", check), changed, replace(guess, cTl=turned))
 
 
 def _starts(guess: gtsam.Pose3 | None) -> Iterator[tuple[str, str, gtsam.Pose3]]:

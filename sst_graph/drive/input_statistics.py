@@ -57,7 +57,6 @@ class ScanStatistics:
         digest: of its points: equal ones are the same scan; 0 of a scan without points.
         sweep_s: between its first and last point [s]; 0 where the points carry no times.
         labelled: number of points by class.
-        median_range: of all points.
         ground: None where too few points are labelled so, or the scan is not one of the chosen ones.
         vehicle_heights: (k,) from the ground to the top of its vehicles.
         sample: (s,) sorted numbers of some points, chosen and numbered by their coordinates: a point that is
@@ -69,7 +68,6 @@ class ScanStatistics:
     digest: int
     sweep_s: float
     labelled: Mapping[int, int]
-    median_range: float
     ground: Ground | None = None
     vehicle_heights: FloatArray = field(default_factory=lambda: np.zeros(0))
     sample: NDArray[np.uint64] = field(default_factory=lambda: np.zeros(0, np.uint64))
@@ -82,8 +80,8 @@ class ImageStatistics:
     Attributes:
         index: of its frame.
         stamp_ns: camera clock [ns].
-        picture_digest, mask_digest: equal ones are the same; a picture that is missing or of a single colour
-            shows nothing, and has that of the mask; 0 of an image without picture and mask.
+        picture_digest: equal ones are the same; a picture that is missing or of a single colour shows
+            nothing, and has that of the mask; 0 of an image without picture and mask.
         labelled: number of pixels by class.
         rows: mean row of each class's pixels, as a share of the image's height.
         profiles: what the picture shows along the mask's contours, and beside them.
@@ -92,7 +90,6 @@ class ImageStatistics:
     index: int
     stamp_ns: int
     picture_digest: int
-    mask_digest: int
     labelled: Mapping[int, int]
     rows: Mapping[int, float]
     profiles: tuple[ContourProfile, ...] = ()
@@ -148,9 +145,7 @@ def scan_statistics(index: int, scan: Scan, closely: bool = True) -> ScanStatist
     labelled = _counts(scan.classes)
     digest = zlib.crc32(np.ascontiguousarray(scan.points).tobytes())
     sample = _sample(scan.points)
-    return ScanStatistics(
-        index, scan.stamp_ns, digest, sweep, labelled, median_range, ground, heights, sample
-    )
+    return ScanStatistics(index, scan.stamp_ns, digest, sweep, labelled, ground, heights, sample)
 
 
 _FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
@@ -175,13 +170,12 @@ def image_statistics(index: int, image: CameraImage, closely: bool = True) -> Im
     places = np.bincount(image.mask.ravel(), _places(image.mask.size), minlength=1)
     rows = {c: float(places[c] / count // width) for c, count in labelled.items()}
     shows = image.has_picture and (_varies(image.pixels[::_FEW, ::_FEW]) or _varies(image.pixels))
-    mask_digest = zlib.crc32(np.ascontiguousarray(image.mask).tobytes())
+    known = image.pixels if shows else image.mask
     nothing = not image.has_picture and not image.has_mask
     return ImageStatistics(
         index,
         image.stamp_ns,
-        0 if nothing else zlib.crc32(np.ascontiguousarray(image.pixels).tobytes()) if shows else mask_digest,
-        mask_digest,
+        0 if nothing else zlib.crc32(np.ascontiguousarray(known).tobytes()),
         labelled,
         {c: row / height for c, row in rows.items()},
         contour_profiles(image.mask, image.pixels, SemanticClass.VEHICLE) if closely and shows else (),

@@ -19,35 +19,17 @@ _NODES = 4
 
 
 @dataclass(frozen=True)
-class PathStep:
-    """Motion of a sensor over an interval that need not begin or end at a stamp.
-
-    Attributes:
-        aTb: pose of the sensor at the end in its frame at the beginning.
-        twist_a, twist_b: (6,) its twist at both ends, in its own frame [rad/s, m/s].
-        covariance: (6, 6) of aTb, [rot rad, trans m], right perturbation.
-        covariance_rate: (6, 6) its change as both ends move on in time [1/s]: between two stamps the noise
-            of their poses is averaged, at a stamp it is not.
-        twist_covariance: (6, 6) of the rate at which aTb changes as both ends move on.
-    """
-
-    aTb: gtsam.Pose3
-    twist_a: FloatArray
-    twist_b: FloatArray
-    covariance: FloatArray
-    covariance_rate: FloatArray
-    twist_covariance: FloatArray
-
-
-@dataclass(frozen=True)
 class PathSteps:
-    """Motions of a sensor over m intervals; each attribute is that of :class:`PathStep`, stacked.
+    """Motions of a sensor over m intervals.
 
     Attributes:
         found: (m,) which of the intervals that were asked for these are: the path does not reach the others.
-        aTbs: (m, 4, 4).
-        twists_a, twists_b: (m, 6).
-        covariances, covariance_rates, twist_covariances: (m, 6, 6).
+        aTbs: (m, 4, 4) poses of the sensor at the end in its frame at the beginning.
+        twists_a, twists_b: (m, 6) its twist at both ends, in its own frame [rad/s, m/s].
+        covariances: (m, 6, 6) of aTb, [rot rad, trans m], right perturbation.
+        covariance_rates: (m, 6, 6) its change as both ends move on in time [1/s]: between two stamps the
+            noise of their poses is averaged, at a stamp it is not.
+        twist_covariances: (m, 6, 6) of the rate at which aTb changes as both ends move on.
     """
 
     found: IntArray
@@ -60,16 +42,6 @@ class PathSteps:
 
     def __len__(self) -> int:
         return len(self.found)
-
-    def __getitem__(self, number: int) -> PathStep:
-        return PathStep(
-            gtsam.Pose3(self.aTbs[number]),
-            self.twists_a[number],
-            self.twists_b[number],
-            self.covariances[number],
-            self.covariance_rates[number],
-            self.twist_covariances[number],
-        )
 
     @classmethod
     def joined(cls, parts: Sequence[PathSteps]) -> PathSteps:
@@ -108,11 +80,6 @@ class SensorPath:
             return None
         poses, twists, _ = self._interpolated(intervals, stamps)
         return gtsam.Pose3(poses[0]), twists[0]
-
-    def step(self, from_ns: int, to_ns: int) -> PathStep | None:
-        """Motion from one time to a later one; None where the path does not reach."""
-        steps = self.steps(np.array([from_ns], np.int64), np.array([to_ns], np.int64))
-        return steps[0] if len(steps) else None
 
     def steps(self, from_ns: NDArray[np.int64], to_ns: NDArray[np.int64]) -> PathSteps:
         """Motions from some times to later ones [ns], (n,) each, where the path reaches."""

@@ -35,19 +35,14 @@ _SOME = 60_000
 """Points, times poses, that are projected at once: their arrays fit into the cache."""
 
 
-def agreement_of_points(edges: Sequence[DriveEdges], state: State, blur_px: float) -> list[FloatArray]:
-    """For each drive, (n,) share of each boundary point in view in the score at a state.
+def score(edges: Sequence[DriveEdges], state: State, blur_px: float) -> float:
+    """The score of a state: see the module.
 
     Args:
         blur_px: sigma of the blur, across each point's edge alone [px].
     """
     pairs = [(own.number, paired) for own in edges if (paired := own.paired(state)) is not None]
-    return [_of_paired(paired, state, number, blur_px) for number, paired in pairs]
-
-
-def score(edges: Sequence[DriveEdges], state: State, blur_px: float) -> float:
-    """The score of a state: see the module."""
-    return float(sum(values.sum() for values in agreement_of_points(edges, state, blur_px)))
+    return score_of_pairs(pairs, state, blur_px)
 
 
 def score_of_pairs(pairs: Sequence[tuple[int, PairedEdges]], state: State, blur_px: float) -> float:
@@ -104,17 +99,17 @@ class BlurredScore:
     def of(
         cls,
         edges: DriveEdges,
-        cTl: gtsam.Pose3,
-        time_offset_s: float,
+        state: State,
         blur_px: float,
         known_fields: dict[int, FloatMap],
     ) -> BlurredScore | None:
-        """At a time offset; the pose only takes the points to the camera and back. None without pairs.
+        """At a state's time offset; its pose only takes points to the camera and back. None without pairs.
 
         Args:
             known_fields: fields under this blur by the identity of their gradients; new ones are put there.
         """
-        paired = edges.paired(State(cTl, (time_offset_s,)))
+        cTl, time_offset_s = state.cTl, state.time_offset_s(edges.number)
+        paired = edges.paired(state)
         if paired is None:
             return None
         known = [k for k, each in enumerate(paired.contours) if isinstance(each, PictureGradients)]

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from sst_graph.edges.agreement import BlurredScore
 from sst_graph.graph.matching import DriveEdges
-from sst_graph.stepwise import Stepwise, run_to_end
+from sst_graph.graph.state import State
+from sst_graph.stepwise import Stepwise
 
 FloatArray = NDArray[np.float64]
 FloatMap = NDArray[np.float32]
@@ -72,21 +73,7 @@ class SearchRegion:
     motion: KnownRotation | None = None
 
 
-@dataclass(frozen=True)
-class EdgeStart:
-    """A pose cTl and a time offset [s] with its score."""
-
-    cTl: gtsam.Pose3
-    time_offset_s: float
-    score: float
-
-
-def edge_starts(edges: DriveEdges, region: SearchRegion) -> list[EdgeStart]:
-    """All steps of :func:`edge_starts_steps`."""
-    return run_to_end(edge_starts_steps(edges, region))
-
-
-def edge_starts_steps(edges: DriveEdges, region: SearchRegion) -> Stepwise[list[EdgeStart]]:
+def edge_starts_steps(edges: DriveEdges, region: SearchRegion) -> Stepwise[list[State]]:
     """The best poses that are :data:`APART_DEG` or :data:`APART_S` apart, best first; none where nothing is
     in view."""
     edges = edges.thinned(_POINTS)
@@ -105,10 +92,10 @@ def edge_starts_steps(edges: DriveEdges, region: SearchRegion) -> Stepwise[list[
             (number, np.stack([R for _, own, R in found if own == number]))
             for number in sorted({own for _, own, _ in found})
         ]
-    starts: list[EdgeStart] = []
-    for each, number, R in found:
+    starts: list[State] = []
+    for _, number, R in found:
         pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(R), region.cTl.translation())
-        start = EdgeStart(pose, region.time_offsets_s[number], each)
+        start = State(pose, (region.time_offsets_s[number],))
         if all(_apart(start, other) for other in starts):
             starts.append(start)
     return starts[:MODES]
@@ -128,7 +115,8 @@ def _scored(
     """
     blur_px, fields = blur[0] * edges.drive.camera.width / _WIDTH_PX, blur[1]
     before = len(fields)
-    blurred = BlurredScore.of(edges, region.cTl, region.time_offsets_s[number], blur_px, fields)
+    state = State(region.cTl, (region.time_offsets_s[number],))
+    blurred = BlurredScore.of(edges, state, blur_px, fields)
     if blurred is None:
         return []
     yield _FIELD_WORK * (len(fields) - before) + 1
@@ -140,9 +128,9 @@ def _scored(
     return [(float(scores[k]), number, rotations[k]) for k in np.argsort(-scores).tolist()]
 
 
-def _apart(a: EdgeStart, b: EdgeStart) -> bool:
+def _apart(a: State, b: State) -> bool:
     far = angle_deg(a.cTl, b.cTl) > APART_DEG
-    return far or abs(a.time_offset_s - b.time_offset_s) > APART_S
+    return far or abs(a.time_offsets_s[0] - b.time_offsets_s[0]) > APART_S
 
 
 def angle_deg(a: gtsam.Pose3, b: gtsam.Pose3) -> float:

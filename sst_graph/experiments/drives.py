@@ -16,7 +16,7 @@ from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.drive.trajectory import camera_twist
 from sst_graph.errors import ConfigError
 from sst_graph.experiments.starts import start_near
-from sst_graph.graph.building import Tracks
+from sst_graph.graph.matching import Tracks
 from sst_graph.metrics import CalibrationErrors, calibration_errors
 from sst_graph.result import CalibrationResult
 from sst_graph.types import GroundTruth, Source

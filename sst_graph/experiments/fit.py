@@ -18,7 +18,6 @@ from sst_graph.batch.by_edges.reasons import turned_states
 from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.batch.config import CalibrationConfig
-from sst_graph.batch.method_estimate import Guess
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import Progress
@@ -27,6 +26,7 @@ from sst_graph.graph.outer_loop import NARROW_KERNELS_PX, solve_joint
 from sst_graph.graph.state import State
 from sst_graph.quality.fit_of_solution import FitOfDrives
 from sst_graph.simulator import SimulationConfig, simulate
+from sst_graph.types import Guess
 
 _HEAD = (
     "| label noise | street | points | at the estimate | at the truth | allowed, at the estimate "

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.batch import CalibrationConfig
-from sst_graph.batch.method_estimate import Guess
 from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import Progress
 from sst_graph.rig.adjustment import adjusted
@@ -22,7 +21,7 @@ from sst_graph.rig.known import KnownPose, KnownRig
 from sst_graph.rig.marginal import RigMarginal
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
 from sst_graph.simulator.rig import beside, stereo_pose, surround, with_mounts
-from sst_graph.types import GroundTruth
+from sst_graph.types import GroundTruth, Guess
 
 FloatArray = NDArray[np.float64]
 

@@ -61,15 +61,12 @@ class CompactObjects:
     heights_m: FloatArray
 
 
-def find_compact_objects(
-    points: FloatArray, rings: NDArray[np.integer] | None, beams: Beams | None = None
-) -> CompactObjects:
+def find_compact_objects(points: FloatArray, rings: NDArray[np.integer] | None) -> CompactObjects:
     """Ground removed, the rest split into objects, each judged by its size.
 
     Args:
         points: (n, 3) in the LiDAR frame, z up [m].
         rings: (n,) laser of each point, or None.
-        beams: of the same points, where they are known.
     """
     n = len(points)
     if n == 0:
@@ -78,8 +75,7 @@ def find_compact_objects(
     heights = heights_above_ground(points)
     raised = ~on_ground(heights) & (heights < _MAX_HEIGHT_M)
     # 2. Neighbours that are near each other.
-    beams = arrange_beams(points, rings) if beams is None else beams
-    a, b = _linked(points, raised, beams)
+    a, b = _linked(points, raised, arrange_beams(points, rings))
     # 3. Connected points are one object.
     links = coo_array((np.ones(len(a), np.bool_), (a, b)), shape=(n, n)).tocsr()
     _, labels = connected_components(links, directed=False)

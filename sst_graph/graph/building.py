@@ -20,7 +20,7 @@ from sst_graph.factors import (
     twist_transfer_factor,
     velocity_factor,
 )
-from sst_graph.graph.matching import GraphConfig, PairMatches, Tracks, associate
+from sst_graph.graph.matching import GraphConfig, PairMatches
 from sst_graph.graph.state import (
     EXTRINSIC,
     State,
@@ -32,21 +32,6 @@ from sst_graph.graph.state import (
     twist_key,
 )
 from sst_graph.types import SemanticClass
-
-__all__ = [
-    "GraphConfig",
-    "PairMatches",
-    "Tracks",
-    "associate",
-    "bias_groups",
-    "joint_graph",
-    "motion_factor",
-    "prior_graph",
-    "silhouettes_factor",
-    "state_from",
-    "tracked_objects",
-]
-
 
 LOWER_EDGE_BIAS_SIGMA_PX = 2.0
 """Deviation of the mask bias that the lower edges of a class share from the class's, where objects have

@@ -23,10 +23,10 @@ from sst_graph.errors import EstimationError
 from sst_graph.factors import residuals
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.fit import OuterIteration
-from sst_graph.graph.building import GraphConfig, PairMatches, Tracks, joint_graph
+from sst_graph.graph.building import joint_graph
 from sst_graph.graph.convergence import OSCILLATION_SIGMAS, STEP_SIGMAS, step_share
 from sst_graph.graph.frozen_problem import FrozenPoint, FrozenProblem
-from sst_graph.graph.matching import DriveMatches, edges_of, match_all
+from sst_graph.graph.matching import DriveMatches, GraphConfig, PairMatches, Tracks, edges_of, match_all
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.stepwise import Stepwise, run_to_end
@@ -114,8 +114,7 @@ class JointSolution:
         matches: its matches, drive by drive.
         outer_iterations: outer iterations done.
         converged: the last step was short compared with the sigmas of the frozen problem.
-        matched_at: the state that the matches were made at.
-        frozen, optimum: the last frozen problem and its optimum.
+        frozen, optimum: the last frozen problem, at the state that the matches were made at, and its optimum.
         iterations: how the estimate was reached.
         problem: that was solved.
         centre: what its weak priors were centred on.
@@ -125,7 +124,6 @@ class JointSolution:
     matches: Sequence[DriveMatches]
     outer_iterations: int
     converged: bool
-    matched_at: State
     frozen: FrozenProblem
     optimum: FrozenPoint
     iterations: tuple[OuterIteration, ...]
@@ -209,16 +207,7 @@ def solve_joint_steps(
                 break
     _LOG.info("joint: %d outer iterations, %d pairs", outer + 1, pairs)
     return JointSolution(
-        state,
-        matches,
-        outer + 1,
-        converged,
-        frozen.state,
-        frozen,
-        optimum,
-        tuple(iterations),
-        problem,
-        centre,
+        state, matches, outer + 1, converged, frozen, optimum, tuple(iterations), problem, centre
     )
 
 

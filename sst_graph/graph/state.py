@@ -7,9 +7,13 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 import gtsam
+import numpy as np
+from numpy.typing import NDArray
 
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.types import SemanticClass
+
+FloatArray = NDArray[np.float64]
 
 EXTRINSIC = gtsam.symbol("E", 0)
 """Key of the extrinsic cTl (Pose3)."""
@@ -85,6 +89,10 @@ class State:
         """Mask biases of a drive by class [px]."""
         return {c: bias for (d, c), bias in self.biases_px.items() if d == drive}
 
+    def moved(self, step: FloatArray) -> State:
+        """Extrinsic and first time offset a step (7,) away, without anything else."""
+        return State(self.cTl.retract(step[:6]), (self.time_offsets_s[0] + float(step[6]),))
+
     def towards(self, other: State, share: float) -> State:
         """Interpolation from this state (share 0) to another one (1), which has all of this one's biases."""
         if share >= 1.0:
@@ -99,6 +107,12 @@ class State:
             _between(self.object_biases_px, other.object_biases_px, share),
             _between(self.nuisances, other.nuisances, share),
         )
+
+
+def difference(a: State, b: State) -> FloatArray:
+    """(7,) step from one state to another, of extrinsic and first time offset, in the tangent space of the
+    covariance."""
+    return np.append(gtsam.Pose3.Logmap(a.cTl.between(b.cTl)), b.time_offsets_s[0] - a.time_offsets_s[0])
 
 
 def _between(mine: Mapping[_Key, float], its: Mapping[_Key, float], share: float) -> dict[_Key, float]:

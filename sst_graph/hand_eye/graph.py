@@ -6,7 +6,7 @@ the extrinsic that is to be estimated.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.drive.path import PathStep, PathSteps, SensorPath
+from sst_graph.drive.path import PathSteps, SensorPath
 from sst_graph.drive.preparation import Drive
 from sst_graph.factors import (
     CameraMotion,
@@ -88,14 +88,6 @@ class CameraStep:
 
 
 @dataclass(frozen=True)
-class MotionPair:
-    """A camera's motion and the LiDAR's over the same time, as the time offset has it."""
-
-    camera: CameraStep
-    lidar: PathStep
-
-
-@dataclass(frozen=True)
 class NoiseScales:
     """By what the sigmas of the odometry are multiplied so that the residuals fit them."""
 
@@ -125,16 +117,13 @@ def lidar_paths(drives: Sequence[Drive]) -> list[SensorPath]:
 
 @dataclass(frozen=True)
 class MotionPairs:
-    """Pairs of a camera's motion and the LiDAR's over the same time: a sequence of :class:`MotionPair`."""
+    """Pairs of a camera's motion and the LiDAR's over the same time, as the time offset has it."""
 
     cameras: tuple[CameraStep, ...]
     lidars: PathSteps
 
     def __len__(self) -> int:
         return len(self.cameras)
-
-    def __iter__(self) -> Iterator[MotionPair]:
-        return (MotionPair(camera, self.lidars[k]) for k, camera in enumerate(self.cameras))
 
 
 def pair_motions(
@@ -151,25 +140,6 @@ def pair_motions(
         parts.append(replace(part, found=own[part.found]))
     lidars = PathSteps.joined(parts)
     return MotionPairs(tuple(steps[k] for k in lidars.found), lidars)
-
-
-@dataclass(frozen=True)
-class HandEyeTerm:
-    """What one pair of motions contributes to the graph.
-
-    Attributes:
-        pair: the motions.
-        factor: on E and D.
-        covariance: (6, 6) of [rotation rad, direction], or (3, 3) where only the rotation is used.
-    """
-
-    pair: MotionPair
-    factor: gtsam.NonlinearFactor
-    covariance: FloatArray
-
-    @property
-    def has_direction(self) -> bool:
-        return len(self.covariance) == 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,25 +182,23 @@ class HandEyeTerms:
         error, H = self.residuals.evaluate(state.cTl, state.time_offsets_s[0], True)
         return self.roots @ H, (self.roots @ error[..., None])[..., 0]
 
-    def each(self) -> list[HandEyeTerm]:
+    def each(self) -> list[gtsam.NonlinearFactor]:
         """A factor for each pair by itself."""
-        return [self._term(k, pair) for k, pair in enumerate(self.pairs)]
+        return [self._factor_of(k) for k in range(len(self))]
 
-    def _term(self, number: int, pair: MotionPair) -> HandEyeTerm:
-        step, residuals, D = pair.lidar, self.residuals, time_offset_key()
-        motion = LidarMotion(step.aTb, step.twist_a, step.twist_b, residuals.time_offset_0_s)
-        if not residuals.directed[number]:
-            own = self.covariances[number][:3, :3]
-            return HandEyeTerm(pair, rotation_hand_eye(EXTRINSIC, D, pair.camera.rotation, motion, own), own)
-        own = self.covariances[number]
+    def _factor_of(self, k: int) -> gtsam.NonlinearFactor:
+        camera, lidars, own = self.pairs.cameras[k], self.pairs.lidars, self.covariances[k]
+        D = time_offset_key()
+        aTb, at_s = gtsam.Pose3(lidars.aTbs[k]), self.residuals.time_offset_0_s
+        motion = LidarMotion(aTb, lidars.twists_a[k], lidars.twists_b[k], at_s)
+        if not self.residuals.directed[k]:
+            return rotation_hand_eye(EXTRINSIC, D, camera.rotation, motion, own[:3, :3])
         measured = CameraMotion(
-            gtsam.Pose3(pair.camera.rotation, pair.camera.motion.direction), np.eye(6), scale_known=False
+            gtsam.Pose3(camera.rotation, camera.motion.direction), np.eye(6), scale_known=False
         )
-        factor = hand_eye_factor(EXTRINSIC, D, measured, motion)
-        recipe = recipe_of(factor)
+        recipe = recipe_of(hand_eye_factor(EXTRINSIC, D, measured, motion))
         assert recipe is not None
-        noise = gtsam.noiseModel.Gaussian.Covariance(own)
-        return HandEyeTerm(pair, replace(recipe, noise=noise).build(), own)
+        return replace(recipe, noise=gtsam.noiseModel.Gaussian.Covariance(own)).build()
 
 
 def hand_eye_terms(pairs: MotionPairs, state: State) -> tuple[HandEyeTerms, NoiseScales]:

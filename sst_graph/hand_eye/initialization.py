@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sst_graph.drive.path import SensorPath
 from sst_graph.hand_eye.graph import CameraStep, MotionPairs, pair_motions
+from sst_graph.types import Guess
 
 FloatArray = NDArray[np.float64]
 
@@ -46,8 +47,7 @@ class MotionStart:
 def motion_starts(
     steps: Sequence[CameraStep],
     paths: Sequence[SensorPath],
-    guess: gtsam.Rot3 | None,
-    guess_time_offset_s: float,
+    guess: Guess,
     max_offset_s: float = MAX_OFFSET_S,
 ) -> list[MotionStart]:
     """The best starts, one for each minimum over the time offset, cheapest first; none without motion.
@@ -61,12 +61,12 @@ def motion_starts(
     chosen = np.unique(np.linspace(0, len(steps) - 1, min(_MAX_PAIRS, len(steps))).astype(int))
     some = [steps[i] for i in chosen] if steps else []
     count = int(np.ceil(max_offset_s / _STEP_S))
-    grid = guess_time_offset_s + _STEP_S * np.arange(-count, count + 1)
+    grid = guess.time_offset_s + _STEP_S * np.arange(-count, count + 1)
     found: list[MotionStart | None] = []
     for time_offset_s in grid:
         pairs = pair_motions(some, paths, float(time_offset_s))
         enough = len(pairs) >= max(2, LEAST_SHARE * len(some))
-        found.append(_best_rotation(pairs, float(time_offset_s), guess) if enough else None)
+        found.append(_best_rotation(pairs, float(time_offset_s), guess.cTl) if enough else None)
     return _minima(found)[:_SELECTED]
 
 
@@ -78,10 +78,10 @@ def _minima(found: Sequence[MotionStart | None]) -> list[MotionStart]:
     return sorted((one for one, low in zip(found, lowest, strict=True) if one and low), key=lambda s: s.cost)
 
 
-def _best_rotation(pairs: MotionPairs, time_offset_s: float, guess: gtsam.Rot3 | None) -> MotionStart:
+def _best_rotation(pairs: MotionPairs, time_offset_s: float, guess: gtsam.Pose3 | None) -> MotionStart:
     """Robust Kabsch over rotation vectors and directions."""
     l_vectors, c_vectors, sigmas = _vectors(pairs)
-    prior = np.zeros((3, 3)) if guess is None else guess.matrix() / _GUESS_SIGMA_RAD**2
+    prior = np.zeros((3, 3)) if guess is None else guess.rotation().matrix() / _GUESS_SIGMA_RAD**2
     weights = np.ones(len(sigmas))
     R = np.eye(3)
     for _ in range(_ROUNDS):

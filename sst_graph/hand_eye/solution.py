@@ -19,7 +19,7 @@ from sst_graph.drive.path import SensorPath
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import EstimationError
 from sst_graph.graph.convergence import STEP_SIGMAS, step_share
-from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
+from sst_graph.graph.state import EXTRINSIC, State, difference, time_offset_key
 from sst_graph.hand_eye.covariance import hand_eye_covariance
 from sst_graph.hand_eye.graph import (
     CameraStep,
@@ -33,6 +33,7 @@ from sst_graph.hand_eye.graph import (
     state_values,
 )
 from sst_graph.hand_eye.initialization import LEAST_SHARE, MAX_OFFSET_S, motion_starts
+from sst_graph.types import Guess
 
 _LOG = logging.getLogger(__name__)
 FloatArray = NDArray[np.float64]
@@ -79,8 +80,7 @@ class MotionSolution:
 
 def solve_motion(
     drives: Sequence[Drive],
-    guess_cTl: gtsam.Pose3 | None,
-    guess_time_offset_s: float,
+    guess: Guess,
     max_offset_s: float = MAX_OFFSET_S,
     progress: Progress | None = None,
 ) -> list[MotionSolution]:
@@ -97,16 +97,15 @@ def solve_motion(
     if len(steps) < MIN_PAIRS:
         raise EstimationError(_too_few(len(steps)))
     # 2. Rotation and time offset on a grid of offsets.
-    guess = None if guess_cTl is None else guess_cTl.rotation()
-    starts = motion_starts(steps, paths, guess, guess_time_offset_s, max_offset_s)
+    starts = motion_starts(steps, paths, guess, max_offset_s)
     if not starts:
         raise EstimationError(_too_few(len(steps)))
     # 3. The graph from each of them, a few steps; from those that differ and fit alike to the end.
-    translation = np.zeros(3) if guess_cTl is None else guess_cTl.translation()
+    translation = np.zeros(3) if guess.cTl is None else guess.cTl.translation()
     solutions: list[MotionSolution] = []
     for number, start in enumerate(starts):
         cTl = gtsam.Pose3(start.cRl, translation)
-        centre = State(guess_cTl or cTl, (guess_time_offset_s,))
+        centre = State(guess.cTl or cTl, (guess.time_offset_s,))
         first = State(cTl, (start.time_offset_s,))
         solution = _solve(steps, paths, first, centre, _FIRST_OUTER)
         if solution is not None:
@@ -173,15 +172,10 @@ def _solve(
         # 3. Move, by less and less of the step where robust weights and the LiDAR's motion at the new offset
         # alternate; stop when the step is small.
         step = step_share(outer) * difference(state, moved)
-        state = State(state.cTl.retract(step[:6]), (state.time_offsets_s[0] + float(step[6]),))
+        state = state.moved(step)
         converged = float(step @ np.linalg.solve(covariance, step)) < STEP_SIGMAS**2
     misfit = len(terms) * (3.0 * np.log(scales.rotation) + 2.0 * np.log(scales.direction))
     return MotionSolution(state, centre, terms, scales, covariance, float(misfit), outer, converged)
-
-
-def difference(a: State, b: State) -> FloatArray:
-    """(7,) step from one state to another, in the tangent space of the covariance."""
-    return np.append(gtsam.Pose3.Logmap(a.cTl.between(b.cTl)), b.time_offsets_s[0] - a.time_offsets_s[0])
 
 
 def _optimise(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:

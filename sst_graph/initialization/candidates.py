@@ -14,7 +14,7 @@ from sst_graph.association.time_pairing import pair_by_time
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.graph.building import Tracks
+from sst_graph.graph.matching import Tracks
 from sst_graph.graph.state import State
 from sst_graph.initialization.global_search import (
     COARSE,
@@ -28,7 +28,7 @@ from sst_graph.initialization.global_search import (
 from sst_graph.initialization.label_agreement import LabelledPoints, SearchFrame, States
 from sst_graph.sampling import evenly_spread
 from sst_graph.stepwise import Stepwise
-from sst_graph.types import SemanticClass
+from sst_graph.types import Guess, SemanticClass
 
 FloatArray = NDArray[np.float64]
 
@@ -49,20 +49,19 @@ class StartProblem:
         drives: all of them.
         tracks: their twists.
         classes: that are compared.
-        guess: rough extrinsic, or None when nothing is known.
-        time_offset_s: rough time offset [s].
+        guess: what is known beforehand.
     """
 
     drives: Sequence[Drive]
     tracks: Tracks
     classes: Sequence[SemanticClass]
-    guess: gtsam.Pose3 | None
-    time_offset_s: float
+    guess: Guess
 
-    def centre(self, start: State) -> State:
-        """What the weak priors are centred on: the guess, or a start's rotation without a translation."""
-        cTl = gtsam.Pose3(start.cTl.rotation(), np.zeros(3)) if self.guess is None else self.guess
-        return State(cTl, (self.time_offset_s,) * len(start.time_offsets_s))
+
+def prior_centre(guess: Guess, start: State) -> State:
+    """What the weak priors are centred on: the guess, or a start's rotation without a translation."""
+    cTl = guess.cTl or gtsam.Pose3(start.cTl.rotation(), np.zeros(3))
+    return State(cTl, (guess.time_offset_s,) * len(start.time_offsets_s))
 
 
 def candidate_steps(problem: StartProblem, config: SearchConfig) -> Stepwise[list[Candidate]]:
@@ -72,11 +71,11 @@ def candidate_steps(problem: StartProblem, config: SearchConfig) -> Stepwise[lis
         EstimationError: no frame shows a searched class to both sensors, or no guess and no search.
     """
     if not config.enabled:
-        if problem.guess is None:
+        if problem.guess.cTl is None:
             raise EstimationError("no guess to start from, and the search is switched off")
-        return [Candidate(problem.guess, problem.time_offset_s, 0.0)]
+        return [Candidate(problem.guess.cTl, problem.guess.time_offset_s, 0.0)]
     frames, camera = _richest_frames(problem, FRAMES)
-    search = SearchProblem(frames, camera, problem.classes, problem.guess, problem.time_offset_s, config)
+    search = SearchProblem(frames, camera, problem.classes, problem.guess, config)
     candidates = yield from search_steps(search, COARSE)
     _LOG.info("start: %d frames, best scores %s", len(frames), [round(c.score, 4) for c in candidates[:5]])
     return candidates
@@ -115,7 +114,7 @@ def _richest_frames(problem: StartProblem, most: int) -> tuple[list[SearchFrame]
 
 def _search_frames(problem: StartProblem, number: int, most: int) -> list[SearchFrame]:
     """Frames spread over a drive that show the classes to both sensors."""
-    drive, time_offset_s, usable = problem.drives[number], problem.time_offset_s, []
+    drive, time_offset_s, usable = problem.drives[number], problem.guess.time_offset_s, []
     for pair in pair_by_time(
         drive.scan_stamps_ns, drive.image_stamps_ns, time_offset_s, drive.image_period_s
     ):

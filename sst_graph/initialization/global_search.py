@@ -27,7 +27,7 @@ from sst_graph.initialization.label_agreement import (
     States,
 )
 from sst_graph.stepwise import Stepwise
-from sst_graph.types import SemanticClass
+from sst_graph.types import Guess, SemanticClass
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -144,44 +144,42 @@ class SearchProblem:
         frames: that are looked at.
         camera: of all of them.
         classes: that are compared.
-        guess: a rough pose, or None when nothing is known: rotations from all of SO(3).
-        time_offset_s: rough time offset [s].
+        guess: what is known beforehand; without a pose, rotations are from all of SO(3).
         config: where to search.
     """
 
     frames: Sequence[SearchFrame]
     camera: PinholeCamera
     classes: Sequence[SemanticClass]
-    guess: gtsam.Pose3 | None
-    time_offset_s: float
+    guess: Guess
     config: SearchConfig
 
     @property
     def spacing(self) -> float:
         """Of the grid of rotations [rad]."""
-        return float(_GRID_STEP if self.guess is None else _BOX_STEP)
+        return float(_GRID_STEP if self.guess.cTl is None else _BOX_STEP)
 
     def grid(self) -> States:
         """Rotations to begin with, at the guess's translation."""
         rotations, translation = _so3_grid(_GRID_STEP), np.zeros(3)
-        if self.guess is not None:
+        if self.guess.cTl is not None:
             box = np.radians(self.config.rotation_deg)
             axis = _BOX_STEP * np.arange(-round(box / _BOX_STEP), round(box / _BOX_STEP) + 1)
             vectors = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
             # Beyond half a turn are the same rotations again.
             vectors = vectors[np.linalg.norm(vectors, axis=1) <= min(_REACH * box, np.pi)]
-            rotations = rotation_matrices(vectors) @ np.asarray(self.guess.rotation().matrix())
-            translation = np.asarray(self.guess.translation(), dtype=np.float64)
+            rotations = rotation_matrices(vectors) @ np.asarray(self.guess.cTl.rotation().matrix())
+            translation = np.asarray(self.guess.cTl.translation(), dtype=np.float64)
         m = len(rotations)
-        return States(rotations, np.tile(translation, (m, 1)), np.full(m, self.time_offset_s))
+        return States(rotations, np.tile(translation, (m, 1)), np.full(m, self.guess.time_offset_s))
 
     def in_reach(self, states: States) -> IntArray:
         """Indices of the states whose rotation is in reach of the guess; all of them where none is."""
         every = np.arange(len(states))
-        if self.guess is None:
+        if self.guess.cTl is None:
             return every
         reach = min(_REACH * np.radians(self.config.rotation_deg), np.pi)
-        trace = np.einsum("mij,ij->m", states.rotations, np.asarray(self.guess.rotation().matrix()))
+        trace = np.einsum("mij,ij->m", states.rotations, np.asarray(self.guess.cTl.rotation().matrix()))
         inside = np.flatnonzero(trace >= 1.0 + 2.0 * np.cos(reach))
         return inside if len(inside) else every
 
@@ -198,7 +196,7 @@ def search_steps(problem: SearchProblem, stages: Sequence[Stage]) -> Stepwise[li
     rng = np.random.default_rng(config.seed)
     points = LabelledPoints.sampled(problem.frames, problem.camera, problem.classes, POINTS_PER_CLASS, rng)
     yield 5
-    free_m = config.free_translation_m if problem.guess is None else config.translation_m
+    free_m = config.free_translation_m if problem.guess.cTl is None else config.translation_m
     families = []
     for score in _SCORES:
         # 1. A grid of rotations on the most blurred masks.
@@ -221,7 +219,7 @@ def search_steps(problem: SearchProblem, stages: Sequence[Stage]) -> Stepwise[li
 
 
 def _kept(stage: Stage, problem: SearchProblem) -> int:
-    return stage.candidates * (_WITHOUT_GUESS if problem.guess is None else 1)
+    return stage.candidates * (_WITHOUT_GUESS if problem.guess.cTl is None else 1)
 
 
 def _improve_steps(
@@ -294,10 +292,11 @@ class _Region:
     @classmethod
     def of(cls, problem: SearchProblem, half_width_m: float, moving: bool) -> _Region:
         """Around a problem's guess; the time offset is sampled where something moves."""
-        translation = np.zeros(3) if problem.guess is None else np.asarray(problem.guess.translation())
+        cTl, time_offset_s = problem.guess.cTl, problem.guess.time_offset_s
+        translation = np.zeros(3) if cTl is None else np.asarray(cTl.translation())
         half_width_s = problem.config.time_offset_s
         scale = [problem.spacing] * 3 + [0.5 * half_width_m] * 3 + [0.5 * half_width_s * moving]
-        return cls(translation, problem.time_offset_s, half_width_m, half_width_s, np.array(scale))
+        return cls(translation, time_offset_s, half_width_m, half_width_s, np.array(scale))
 
     def clip(self, states: States) -> States:
         return States(

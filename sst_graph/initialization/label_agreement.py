@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Self
 
 import cv2
 import numpy as np
@@ -60,8 +60,9 @@ class States:
     translations: FloatArray
     offsets: FloatArray
 
-    def take(self, index: IntArray | slice) -> States:
-        return States(self.rotations[index], self.translations[index], self.offsets[index])
+    def take(self, index: IntArray | slice) -> Self:
+        """Some of them, by position."""
+        return type(self)(*(column[index] for column in vars(self).values()))
 
     def __len__(self) -> int:
         return len(self.offsets)

@@ -32,6 +32,7 @@ from sst_graph.factors.motion import cross
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.features.mask_contour import MIN_GRADIENT, ContourMap, are_unknown, well_inside
 from sst_graph.graph.matching import DriveEdges
+from sst_graph.initialization.label_agreement import States
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -50,20 +51,10 @@ _NEAR_NS = 4_000_000
 
 
 @dataclass(frozen=True)
-class Poses:
-    """Rotations (m, 3, 3), translations (m, 3) [m], offsets (m,) [s] and mask biases (m, classes) [px]."""
+class Poses(States):
+    """States with mask biases (m, classes) [px]."""
 
-    rotations: FloatArray
-    translations: FloatArray
-    offsets: FloatArray
     biases: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.offsets)
-
-    def take(self, index: IntArray) -> Poses:
-        """Some of the poses, by position."""
-        return Poses(self.rotations[index], self.translations[index], self.offsets[index], self.biases[index])
 
 
 @dataclass(frozen=True)

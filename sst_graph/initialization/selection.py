@@ -18,13 +18,11 @@ from numpy.typing import NDArray
 
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
-from sst_graph.graph.building import GraphConfig
-from sst_graph.graph.matching import edges_of
+from sst_graph.graph.matching import GraphConfig, edges_of
 from sst_graph.graph.outer_loop import KERNELS_PX, NARROW_KERNELS_PX, JointSolution, agreement
 from sst_graph.graph.state import State
 from sst_graph.initialization.candidates import StartProblem, candidate_steps, label_score_steps
 from sst_graph.initialization.global_search import Candidate, SearchConfig
-from sst_graph.initialization.label_agreement import States
 from sst_graph.initialization.pose_batch import BatchEquations, Poses
 from sst_graph.initialization.refinement import RefinementProblem, refine_steps
 from sst_graph.sampling import evenly_spread
@@ -108,13 +106,14 @@ def select_start_steps(
     if not config.enabled:
         start = (Calibration(candidates[0].cTl, candidates[0].time_offset_s),)
         return Selection(start, start, candidates[0].score)
-    candidates = candidates[: _CANDIDATES_WITHOUT_GUESS if problem.guess is None else most_candidates]
+    candidates = candidates[: _CANDIDATES_WITHOUT_GUESS if problem.guess.cTl is None else most_candidates]
     selection = yield from select_among_steps(problem, candidates, graph, config, most_scans)
-    if problem.guess is not None:
+    if problem.guess.cTl is not None:
         return selection
     closer = []
     for cTl, time_offset_s in selection.distant:
-        around = yield from candidate_steps(replace(problem, guess=cTl), config)
+        guess = replace(problem.guess, cTl=cTl)
+        around = yield from candidate_steps(replace(problem, guess=guess), config)
         closer += [Candidate(cTl, time_offset_s, selection.score), *around[:most_candidates]]
     return (yield from select_among_steps(problem, closer, graph, config, most_scans))
 
@@ -136,7 +135,7 @@ def select_among_steps(
     full = RefinementProblem.of(edges_of(few, problem.tracks, graph), graph)
     rough = full.thinned(_WIDE_POINTS)
     yield 10
-    poses = _poses(_with_offsets(candidates, problem.time_offset_s), full.biases)
+    poses = _poses(_with_offsets(candidates, problem.guess.time_offset_s), full.biases)
     centres = _centres(poses, problem)
     for kernels_px in _WIDE_STAGES:
         poses = yield from refine_steps(rough, poses, centres, kernels_px)
@@ -147,9 +146,10 @@ def select_among_steps(
     poses = yield from refine_steps(full, poses, centres, _NARROW_STAGE)
     equations = yield from full.equation_steps(poses, _NARROW_STAGE[-1])
     # 3. The best that stayed within reach, by boundaries and by all labels.
-    states = States(poses.rotations, poses.translations, poses.offsets)
-    scores = yield from label_score_steps(problem, states, config)
-    scores = equations.agreements * np.sqrt(np.maximum(scores, 0.0)) * _in_reach(poses, problem.guess, config)
+    scores = yield from label_score_steps(problem, poses, config)
+    scores = (
+        equations.agreements * np.sqrt(np.maximum(scores, 0.0)) * _in_reach(poses, problem.guess.cTl, config)
+    )
     order = _different(poses, scores)
     if scores[order[0]] <= 0.0:
         raise EstimationError("no candidate of the search leads to a solution near the guess")
@@ -175,7 +175,7 @@ def _with_alternative(starts: Sequence[Calibration], scores: FloatArray) -> tupl
     """The first of some starts, best first, after the best one an alternative to it, where there is one."""
     best = starts[0].cTl
     for number, start in enumerate(starts):
-        if scores[number] > ALTERNATIVE_RATIO * scores[0] and _turn_rad(best, start.cTl) > _SAME_RAD:
+        if scores[number] > ALTERNATIVE_RATIO * scores[0] and turn_rad(best, start.cTl) > _SAME_RAD:
             others = [one for other, one in enumerate(starts) if other not in (0, number)]
             return (starts[0], starts[number], *others[: _SELECTED - 1])
     return tuple(starts[:_SELECTED])
@@ -185,7 +185,7 @@ def _far_apart(starts: Sequence[Calibration]) -> tuple[Calibration, ...]:
     """Some starts that are turned by more than :data:`_FAR_RAD` against every better one."""
     chosen: list[Calibration] = []
     for start in starts:
-        if all(_turn_rad(start.cTl, other.cTl) > _FAR_RAD for other in chosen):
+        if all(turn_rad(start.cTl, other.cTl) > _FAR_RAD for other in chosen):
             chosen.append(start)
     return tuple(chosen[:_DISTANT])
 
@@ -193,7 +193,7 @@ def _far_apart(starts: Sequence[Calibration]) -> tuple[Calibration, ...]:
 def _alike(one: State, other: State) -> bool:
     """Whether two solutions lead to one estimate."""
     step = one.cTl.between(other.cTl)
-    near = _turn_rad(one.cTl, other.cTl) < _ALIKE_RAD
+    near = turn_rad(one.cTl, other.cTl) < _ALIKE_RAD
     near &= bool((np.abs(step.translation()) <= _ALIKE_M).all())
     return near and abs(one.time_offsets_s[0] - other.time_offsets_s[0]) <= _ALIKE_S
 
@@ -229,8 +229,8 @@ def _cTls(poses: Poses) -> list[gtsam.Pose3]:
 
 
 def _centres(poses: Poses, problem: StartProblem) -> Poses:
-    """What the weak priors of each pose are centred on, as in :meth:`StartProblem.centre`."""
-    offsets, guess = np.full(len(poses), problem.time_offset_s), problem.guess
+    """What the weak priors of each pose are centred on, as :func:`prior_centre` has it."""
+    offsets, guess = np.full(len(poses), problem.guess.time_offset_s), problem.guess.cTl
     if guess is None:
         return Poses(poses.rotations, np.zeros_like(poses.translations), offsets, poses.biases)
     rotations = np.broadcast_to(guess.rotation().matrix(), poses.rotations.shape)
@@ -269,5 +269,6 @@ def _in_reach(poses: Poses, guess: gtsam.Pose3 | None, config: SearchConfig) -> 
     return np.asarray((away < REACH * config.translation_m).all(axis=1))
 
 
-def _turn_rad(one: gtsam.Pose3, other: gtsam.Pose3) -> float:
+def turn_rad(one: gtsam.Pose3, other: gtsam.Pose3) -> float:
+    """Angle between two rotations [rad]."""
     return float(np.linalg.norm(gtsam.Rot3.Logmap(one.rotation().between(other.rotation()))))

@@ -25,9 +25,9 @@ from sst_graph.covariance.error_model import ErrorModel, fit_error_model
 from sst_graph.covariance.match_table import MatchTable
 from sst_graph.covariance.sums import ScoreSums, total
 from sst_graph.drive.preparation import Drive
-from sst_graph.graph.building import PairMatches
 from sst_graph.graph.elimination import Unknowns
 from sst_graph.graph.linear import information_inverse
+from sst_graph.graph.matching import PairMatches
 from sst_graph.graph.state import State, time_offset_key, twist_key
 from sst_graph.inspect.frame_information import FrameInformation, positive_part
 from sst_graph.inspect.gained import bits_between

@@ -11,12 +11,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError, printable
 from sst_graph.graph.state import State
-from sst_graph.hand_eye.graph import PRIOR_SIGMAS, HandEyeTerm, state_values
+from sst_graph.hand_eye.graph import PRIOR_SIGMAS, state_values
 from sst_graph.inspect.frame_information import MAX_NUMBER
 from sst_graph.result import CalibrationResult, FrameId
 from sst_graph.types import ByValue
@@ -58,11 +59,11 @@ def bits_between(before: FloatArray, after: FloatArray) -> float:
     return 0.5 * (_log_det(before) - _log_det(after)) / float(np.log(2.0))
 
 
-def pair_gains(terms: Sequence[HandEyeTerm], frames: Sequence[FrameId], state: State) -> Gained:
-    """What each pair of motions adds to all others, the pairs counted as independent."""
+def pair_gains(factors: Sequence[gtsam.NonlinearFactor], frames: Sequence[FrameId], state: State) -> Gained:
+    """What each pair of motions adds to all others, the pairs counted as independent; factors: of each."""
     values = state_values(state)
     both = np.outer(PRIOR_SIGMAS, PRIOR_SIGMAS)
-    parts = [both * term.factor.linearize(values).information() for term in terms]
+    parts = [both * factor.linearize(values).information() for factor in factors]
     total = np.eye(7) + np.sum(parts, axis=0)
     covariance, gains = np.linalg.inv(total), []
     for frame, part in zip(frames, parts, strict=True):

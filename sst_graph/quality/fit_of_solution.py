@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from sst_graph.drive.preparation import Drive
 from sst_graph.fit import CLOSE_PX, MOST_POINTS, Fit, FitQuality, OuterIteration, Profile
-from sst_graph.graph.building import Tracks
-from sst_graph.graph.matching import GraphConfig, edges_of
+from sst_graph.graph.matching import GraphConfig, Tracks, edges_of
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import ObjectId
 from sst_graph.quality.close_points import attainable_share, close_share

@@ -17,11 +17,10 @@ from sst_graph.batch.calibrate import (
     finished,
     preparation_of,
     prepare_drives,
-    prepared_classes,
     solve_problem,
 )
-from sst_graph.batch.config import CalibrationConfig
-from sst_graph.batch.method_estimate import Guess, MethodEstimate
+from sst_graph.batch.config import CalibrationConfig, prepared_classes
+from sst_graph.batch.method_estimate import UNKNOWN_SIGMAS, MethodEstimate
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.batch.sources import as_sources
 from sst_graph.config import expect_settings, to_dict
@@ -46,7 +45,7 @@ from sst_graph.rig.joint_covariance import JointCovariance, joint_covariance
 from sst_graph.rig.known import KnownRig
 from sst_graph.rig.marginal import RigMarginal
 from sst_graph.rig.result import RigResult, worst
-from sst_graph.types import Source
+from sst_graph.types import Guess, Source
 from sst_graph.validation import checked_guess
 
 FloatArray = NDArray[np.float64]
@@ -217,13 +216,7 @@ class _Camera:
         outcome = None if self.estimate is None else self.estimate.solved
         if outcome is None:
             return float(self.errors.estimated) if isinstance(self.errors, SharedErrors) else 1.0
-        table = outcome.estimate.robust.table
-        weights = np.bincount(table.sides, table.root_weights**2)
-        return float(weights.sum() ** 2 / max(float(weights @ weights), 1e-12))
-
-
-_UNKNOWN_SIGMAS = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
-"""(7,) deviations of a camera of which nothing is known [rad, m, s], as of a result without an estimate."""
+        return outcome.estimate.robust.table.clusters
 
 
 def _solved(problem: CalibrationProblem, start: Guess | None = None) -> _Camera:
@@ -277,7 +270,7 @@ class _Rig:
         camera, poses = self.cameras[name], self.known.poses
         linked = self.known.one_trigger or any(name in (p.camera, p.reference) for p in poses)
         others_know = linked and any(other.trusted for other in self.cameras.values())
-        return np.diag(_UNKNOWN_SIGMAS**2) if others_know and not camera.trusted else camera.result.covariance
+        return np.diag(UNKNOWN_SIGMAS**2) if others_know and not camera.trusted else camera.result.covariance
 
     @cached_property
     def marginal(self) -> RigMarginal:

@@ -21,8 +21,8 @@ from sst_graph.covariance.cluster_robust import RobustCovariance, steps_without_
 from sst_graph.covariance.error_model import by_side_and_frame
 from sst_graph.covariance.jackknife import ObjectSpread, bounded_ratio
 from sst_graph.factors.velocity import transferred
-from sst_graph.graph.building import PairMatches
 from sst_graph.graph.elimination import twist_responses
+from sst_graph.graph.matching import PairMatches
 from sst_graph.graph.outer_loop import JointSolution
 from sst_graph.graph.state import EXTRINSIC, time_offset_key, twist_key
 
@@ -83,8 +83,7 @@ class CameraInfluences:
         # 1. How the parts of the covariance are composed.
         modelled = robust.bread + robust.bread @ scores.excess(robust.model) @ robust.bread
         left_out = steps_without_objects(robust.table, robust.bread)
-        weights = np.asarray(np.bincount(robust.table.objects, robust.table.root_weights**2), np.float64)
-        spread = ObjectSpread.of(left_out, weights)
+        spread = ObjectSpread.of(left_out, robust.table.object_weights)
         of_model, of_objects = spread.shares(modelled)
         ratio = bounded_ratio(robust.table.weight_curvature_ratio)
         root = ratio * np.sqrt(of_model)
@@ -183,7 +182,7 @@ def _by_motion(robust: RobustCovariance, solution: JointSolution) -> tuple[IntAr
     values, unknowns = solution.values, robust.unknowns
     cTl = values.atPose3(EXTRINSIC)
     responses = twist_responses(solution.graph, values, unknowns)
-    back = np.asarray(solution.matched_at.cTl.inverse().AdjointMap()).T
+    back = np.asarray(solution.frozen.state.cTl.inverse().AdjointMap()).T
     found: dict[int, FloatArray] = {}
     seen: set[int] = set()
     for pair in solution.pairs:
@@ -192,7 +191,7 @@ def _by_motion(robust: RobustCovariance, solution: JointSolution) -> tuple[IntAr
             continue
         seen.add(key)
         clock = time_offset_key(solution.state.clock(pair.drive))
-        since_s = float(values.atVector(clock)[0]) - solution.matched_at.time_offset_s(pair.drive)
+        since_s = float(values.atVector(clock)[0]) - solution.frozen.state.time_offset_s(pair.drive)
         sample = pair.l_twist
         _, by_cTl, by_offset = transferred(
             sample.twist, sample.acceleration, since_s, values.atVector(key), cTl, True

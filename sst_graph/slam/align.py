@@ -253,7 +253,12 @@ def align_frame(
             velocities,
         )
         found |= match_silhouettes(pair, place, offset_s, biases_px, kernel, config)
-    return _frame_alignments(found)
+    return FrameAlignments(
+        tuple(found),
+        tuple(matches.alignment for matches in found.values()),
+        tuple(matches.objects for matches in found.values()),
+        tuple(matches.sides for matches in found.values()),
+    )
 
 
 def features_of(
@@ -316,12 +321,3 @@ def _carried(
             points, shift = carried[c], late_s * velocity
             carried[c] = replace(points, lPs=points.lPs + shift, outward=points.outward + shift)
     return carried
-
-
-def _frame_alignments(found: Mapping[SemanticClass, SilhouetteMatches]) -> FrameAlignments:
-    return FrameAlignments(
-        tuple(found),
-        tuple(matches.alignment for matches in found.values()),
-        tuple(matches.objects for matches in found.values()),
-        tuple(matches.sides for matches in found.values()),
-    )

@@ -120,14 +120,8 @@ class TermRows:
     @classmethod
     def joined(cls, parts: Sequence[TermRows]) -> TermRows:
         """One after the other."""
-        parts = [cls.none(), *parts]
-        return cls(
-            np.concatenate([part.J for part in parts]),
-            np.concatenate([part.r for part in parts]),
-            np.concatenate([part.weights for part in parts]),
-            np.concatenate([part.sigmas_px for part in parts]),
-            np.concatenate([part.sides for part in parts]),
-        )
+        columns = zip(*(vars(part).values() for part in (cls.none(), *parts)), strict=True)
+        return cls(*(np.concatenate(column) for column in columns))
 
     def __len__(self) -> int:
         return len(self.r)

@@ -38,10 +38,6 @@ class ObjectSides:
         self._tracks: list[_Track] = []
         self._names: dict[tuple[int, SemanticClass, int], int] = {}
 
-    def __len__(self) -> int:
-        """How many sides have a number."""
-        return SIDES * len(self._tracks)
-
     def of(self, scan_ns: int, found: FrameAlignments, wTl: gtsam.Pose3) -> list[NDArray[np.intp]]:
         """Of each alignment, (n,) number of the side that each match lies on.
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from sst_graph.batch.config import CalibrationConfig
+from sst_graph.batch.config import CalibrationConfig, prepared_classes
 from sst_graph.config import Settings, setting
-from sst_graph.types import SemanticClass
 
 
 @dataclass(frozen=True)
@@ -107,10 +106,9 @@ class TrackerConfig(Settings):
         """The same with a variable in the graph for each assumption that is to be estimated, and with objects
         without a class among the classes where edges are aligned."""
         calibration = self.calibration.estimating
+        calibration = replace(calibration, classes=prepared_classes(calibration))
         if calibration.method == "edges":
-            calibration = replace(calibration, classes=(SemanticClass.OBJECT,), lower_edges="never")
-        elif calibration.method == "both":
-            calibration = replace(calibration, classes=(*calibration.classes, SemanticClass.OBJECT))
+            calibration = replace(calibration, lower_edges="never")
         return replace(self, calibration=calibration)
 
     def __post_init__(self) -> None:

@@ -25,7 +25,7 @@ from sst_graph.tracker.by_edges.reviews import EdgeReviews
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.history import History, HistoryEntry
 from sst_graph.tracker.monitor.statistic import ComparedEstimate
-from sst_graph.tracker.start.first_estimate import Guess
+from sst_graph.tracker.start.first_estimate import StartGuess
 from sst_graph.tracker.start.initializer import Initialization
 from sst_graph.tracker.uncertainty import Uncertainty
 from sst_graph.tracker.window.epochs import MatchedPair
@@ -88,7 +88,7 @@ class OnlineEstimate:
         edges: reviews of the estimate where edges are aligned.
     """
 
-    def __init__(self, matcher: WindowMatcher, config: TrackerConfig, guess: Guess) -> None:
+    def __init__(self, matcher: WindowMatcher, config: TrackerConfig, guess: StartGuess) -> None:
         self.matcher, self.config, self.guess = matcher, config, guess
         self.smoother: WindowSmoother | None = None
         self.uncertainty = Uncertainty.nothing()
@@ -117,7 +117,7 @@ class OnlineEstimate:
         self.information_log.add(window.next_scan - 1, self.reported_covariance())
         _LOG.info("tracker: started over %d scans", initialization.scans)
 
-    def restart(self, guess: Guess) -> None:
+    def restart(self, guess: StartGuess) -> None:
         """Discard the estimate."""
         self.guess = guess
         self.stop_relinearization()
@@ -184,11 +184,6 @@ class OnlineEstimate:
         if self.edges is None or self.smoother is None:
             return considered
         return considered + self.edges.covariance(self.smoother, self.uncertainty)
-
-    def catch_up(self) -> None:
-        """Repeat the work that a stored review had done."""
-        if self.edges is not None:
-            self.edges.catch_up()
 
     @property
     def softness(self) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from contextlib import suppress
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -82,6 +83,11 @@ class SpreadWork(ABC, Generic[_T]):
             self._run = Run(self.steps())
         self.work += work or 0
         return self._run.until(None if work is None else self.work)
+
+    def catch_up(self) -> None:
+        """Repeat the work that it had done when it was stored."""
+        with suppress(*NUMERICAL_ERRORS):
+            self.advance(0)
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the running computation, which follows from the work."""

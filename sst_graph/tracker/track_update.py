@@ -10,13 +10,12 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.batch.method_estimate import UNKNOWN_SIGMAS
 from sst_graph.result import WeakDirection
 from sst_graph.types import ByValue
 
 FloatArray = NDArray[np.float64]
 Sensor = Literal["image", "scan"]
-UNKNOWN_SIGMAS = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
-"""Of an estimate that does not exist yet [rad, m, s]."""
 TrackStatus = Literal["starting", "ok", "unobservable", "unconfirmed", "contradicted", "alarm"]
 
 

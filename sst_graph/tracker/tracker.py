@@ -25,7 +25,7 @@ from sst_graph.tracker.monitor.monitor import Monitor
 from sst_graph.tracker.monitor.statistic import ComparedEstimate
 from sst_graph.tracker.result import tracker_result
 from sst_graph.tracker.spread_work import NUMERICAL_ERRORS
-from sst_graph.tracker.start.first_estimate import Guess
+from sst_graph.tracker.start.first_estimate import StartGuess
 from sst_graph.tracker.start.initializer import (
     Initialization,
     Initializer,
@@ -85,7 +85,7 @@ class Tracker:
         settings = expect_settings(config, TrackerConfig)
         self.setup = Setup(camera, settings, initial, initial_time_offset_s)
         config = self.setup.config.estimating
-        guess = Guess(initial, initial_time_offset_s, search=config.calibration.search.enabled)
+        guess = StartGuess(initial, initial_time_offset_s, search=config.calibration.search.enabled)
         self.inputs = SensorInputs(camera, config, searched_scans(config))
         self.matcher = WindowMatcher(self.inputs.window, config)
         self.initializer = Initializer(guess, config)
@@ -292,7 +292,7 @@ class Tracker:
         window, point, guess = self.inputs.window, self.estimate.point, self.initializer.guess
         if clock_step_ns:
             moved = f"the scan stamps moved by {1e-9 * clock_step_ns:+.3f} s and go on from there"
-            near = Guess(point.cTl, point.time_offset_s, guess.search)
+            near = StartGuess(point.cTl, point.time_offset_s, guess.search)
             return Restart(
                 near, len(window.scans), f"{moved}: the calibration is estimated again", alarm=True
             )
@@ -307,7 +307,7 @@ class Tracker:
         # Most likely the clock was set.
         changes = self.monitor.changes
         before = changes.before(scan) or point
-        near = Guess(before.cTl, before.time_offset_s + jump.time_offset_s, search=changes.far)
+        near = StartGuess(before.cTl, before.time_offset_s + jump.time_offset_s, search=changes.far)
         return Restart(near, since, jump.sentence, alarm=True, chi2=jump.chi2)
 
     def _restart(self, restart: Restart, stamp_ns: int) -> TrackUpdate:
@@ -339,7 +339,7 @@ class Tracker:
             if self.inputs.failed(why):
                 point, guess = self.estimate.point, self.initializer.guess
                 self.inputs.restart()
-                self._restart(Restart(Guess(point.cTl, point.time_offset_s, guess.search), 0, why), 0)
+                self._restart(Restart(StartGuess(point.cTl, point.time_offset_s, guess.search), 0, why), 0)
                 why = f"{why}; the calibration is estimated again"
         stamp_ns = data.stamp_ns if isinstance(data, Scan | CameraImage) else 0
         known = isinstance(stamp_ns, int | np.integer) and abs(int(stamp_ns)) <= LATEST_NS

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.batch.by_edges.positions import POSITIONS
+from sst_graph.batch.method_estimate import UNKNOWN_SIGMAS
 from sst_graph.covariance.considered import steps_by
 from sst_graph.errors import EstimationError
 from sst_graph.graph.linear import scaled_inverse
 from sst_graph.tracker.monitor.statistic import EstimateCovariance
 from sst_graph.tracker.sums.held import EDGE_ERRORS, SHIFTS
-from sst_graph.tracker.track_update import UNKNOWN_SIGMAS
 from sst_graph.tracker.window.smoother import WindowSmoother
 
 FloatArray = NDArray[np.float64]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sst_graph.factors import residuals
 from sst_graph.fit import MatchedFrame
-from sst_graph.graph.building import PairMatches
+from sst_graph.graph.matching import PairMatches
 from sst_graph.report.drawn_frame import DrawnFrame
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.tracker.window.matcher import WindowMatcher

@@ -14,7 +14,6 @@ from streets import crowded_street
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drives
 from sst_graph.batch.assumption_tests import LinearProblem, SolvedProblem, few_objects_factor
-from sst_graph.batch.method_estimate import Guess
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.config import with_overrides
 from sst_graph.covariance.cluster_robust import robust_covariance
@@ -27,6 +26,7 @@ from sst_graph.graph.outer_loop import solve_joint
 from sst_graph.graph.state import State, nuisance_key
 from sst_graph.inspect.budget_text import budget_lines
 from sst_graph.result import CalibrationResult
+from sst_graph.types import Guess
 
 CONFIG = with_overrides(
     CalibrationConfig(), ["search.enabled=false", "use_motion=never", "check_contradictions=false"]

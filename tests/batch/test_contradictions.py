@@ -15,7 +15,6 @@ from stored import simulated
 from sst_graph import CalibrationConfig, open_source
 from sst_graph.batch.calibrate import calibrate_prepared, prepare_drives
 from sst_graph.batch.contradictions import find_contradictions
-from sst_graph.batch.method_estimate import Guess
 from sst_graph.batch.motion_factor import fuse_motion
 from sst_graph.batch.part_solver import Part, PartSolver, SolvedPart
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
@@ -26,7 +25,7 @@ from sst_graph.graph.outer_loop import JointConfig, solve_joint
 from sst_graph.graph.state import State
 from sst_graph.result import CalibrationResult
 from sst_graph.simulator import SimulatedDrive, SimulationConfig
-from sst_graph.types import Frame, Source
+from sst_graph.types import Frame, Guess, Source
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 STOP = DATA / "kitti_2011_09_26_stop"

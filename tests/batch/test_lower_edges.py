@@ -13,7 +13,7 @@ from sst_graph.batch.config import UseLowerEdges
 from sst_graph.batch.lower_edges import MIN_CONCENTRATION, lower_edge_support, with_lower_edges
 from sst_graph.drive.preparation import Drive, image_features
 from sst_graph.features.lidar_edges import Edge
-from sst_graph.graph.building import Tracks, associate
+from sst_graph.graph.matching import Tracks, associate
 from sst_graph.graph.outer_loop import (
     NARROW_KERNELS_PX,
     JointConfig,

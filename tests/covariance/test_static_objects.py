@@ -9,14 +9,15 @@ import numpy as np
 from streets import prepared_street, standing_street
 
 from sst_graph.batch import CalibrationConfig
-from sst_graph.batch.method_estimate import Guess, MethodEstimate, result_of
+from sst_graph.batch.method_estimate import MethodEstimate, result_of
 from sst_graph.covariance.cluster_robust import RobustCovariance, robust_covariance
 from sst_graph.covariance.static_objects import static_covariance
 from sst_graph.factors import RobustKernel
-from sst_graph.graph.building import GraphConfig, PairMatches, Tracks, associate, joint_graph
+from sst_graph.graph.building import joint_graph
+from sst_graph.graph.matching import GraphConfig, PairMatches, Tracks, associate
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import ObjectId, object_tracks
-from sst_graph.types import SemanticClass
+from sst_graph.types import Guess, SemanticClass
 
 CONFIG = GraphConfig()
 VEHICLE = SemanticClass.VEHICLE

@@ -29,7 +29,7 @@ from sst_graph.inspect.reasons import short_reason
 from sst_graph.odometry.sweep import SweepDecision
 from sst_graph.simulator import SimulationConfig
 from sst_graph.sweep_timing import SweepTiming
-from sst_graph.types import NO_PICTURE, Scan, SemanticClass
+from sst_graph.types import NO_PICTURE, Guess, Scan, SemanticClass
 from studies.subtle_faults import SUBTLE_FAULTS, SUBTLE_NAMED, repeated_pictures
 from studies.wrong_drives import INPUT_FAULTS, NAMED, shifted_masks
 
@@ -193,14 +193,14 @@ def test_the_best_change_is_named_and_not_the_first_that_fits() -> None:
     """Of a street whose intrinsics have half the focal length: an inverted start fits well by chance."""
     right = prepared().camera
 
-    def fit(one: Drive, guess: gtsam.Pose3 | None, time_offset_s: float) -> Fit:
+    def fit(one: Drive, guess: Guess) -> Fit:
         if one.camera.fx > 1.5 * right.fx:
-            return Fit(CTL, time_offset_s, 0.68, 0.86)
-        if guess is not None and guess.equals(CTL.inverse(), 1e-9):
-            return Fit(CTL, time_offset_s, 0.53, 0.78)
-        return Fit(CTL, time_offset_s, 0.22, 0.47)
+            return Fit(CTL, guess.time_offset_s, 0.68, 0.86)
+        if guess.cTl is not None and guess.cTl.equals(CTL.inverse(), 1e-9):
+            return Fit(CTL, guess.time_offset_s, 0.53, 0.78)
+        return Fit(CTL, guess.time_offset_s, 0.22, 0.47)
 
-    found = best_hypothesis(prepared(), CTL, 0.0, fit, fit(prepared(), CTL, 0.0))
+    found = best_hypothesis(prepared(), Guess(CTL), fit, fit(prepared(), Guess(CTL)))
     assert found is not None and NAMED["half the focal length"] in found.cause
 
 

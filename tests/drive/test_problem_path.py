@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from sst_graph.drive.path import SensorPath
+from sst_graph.drive.path import PathSteps, SensorPath
 from sst_graph.types import RelativeMotion
 
 PERIOD_NS = 100_000_000
@@ -30,6 +30,12 @@ def motions(pose: Callable[[float], gtsam.Pose3], stamps_ns: list[int]) -> list[
     ]
 
 
+def step_of(path: SensorPath, from_ns: int, to_ns: int) -> PathSteps | None:
+    """The motion from one time to a later one by itself; None where the path does not reach."""
+    steps = path.steps(np.array([from_ns], np.int64), np.array([to_ns], np.int64))
+    return steps if len(steps) else None
+
+
 def evenly(count: int) -> list[int]:
     return [k * PERIOD_NS for k in range(count)]
 
@@ -47,14 +53,14 @@ def test_between_stamps_it_follows_the_motion(jitter: int) -> None:
     stamps = [k * PERIOD_NS + jitter * (k % 3) for k in range(40)]
     path = SensorPath(motions(weaving, stamps))
     for t in np.arange(0.15, 3.6, 0.037):
-        step = path.step(round(t * 1e9), round((t + 0.1) * 1e9))
+        step = step_of(path, round(t * 1e9), round((t + 0.1) * 1e9))
         assert step is not None
-        error = weaving(t).between(weaving(t + 0.1)).localCoordinates(step.aTb)
+        error = weaving(t).between(weaving(t + 0.1)).localCoordinates(gtsam.Pose3(step.aTbs[0]))
         assert np.abs(error[:3]).max() < 4e-4 and np.abs(error[3:]).max() < 4e-3
         h = 1e-5
         twist = gtsam.Pose3.Logmap(weaving(t - h).between(weaving(t + h))) / (2.0 * h)
-        np.testing.assert_allclose(step.twist_a[:3], twist[:3], atol=0.02)
-        np.testing.assert_allclose(step.twist_a[3:], twist[3:], atol=0.1)
+        np.testing.assert_allclose(step.twists_a[0, :3], twist[:3], atol=0.02)
+        np.testing.assert_allclose(step.twists_a[0, 3:], twist[3:], atol=0.1)
 
 
 def test_twists_are_continuous_at_stamps() -> None:
@@ -68,21 +74,21 @@ def test_twists_are_continuous_at_stamps() -> None:
 def test_steady_motion_by_hand() -> None:
     """2 m/s along x: from 0.13 s to 0.27 s it moves 0.28 m."""
     path = SensorPath(motions(lambda t: gtsam.Pose3(gtsam.Rot3(), np.array([2.0 * t, 0, 0])), evenly(5)))
-    step = path.step(130_000_000, 270_000_000)
+    step = step_of(path, 130_000_000, 270_000_000)
     assert step is not None
-    np.testing.assert_allclose(step.aTb.translation(), [0.28, 0, 0], atol=1e-12)
-    np.testing.assert_allclose(step.twist_b, [0, 0, 0, 2.0, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(gtsam.Pose3(step.aTbs[0]).translation(), [0.28, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(step.twists_b[0], [0, 0, 0, 2.0, 0, 0], atol=1e-12)
 
 
 def test_no_path_beyond_the_ends_or_over_a_failure() -> None:
     found = motions(weaving, evenly(8))
     path = SensorPath(found)
-    assert path.at(-1) is None and path.step(650_000_000, 710_000_000) is None
+    assert path.at(-1) is None and step_of(path, 650_000_000, 710_000_000) is None
     broken = SensorPath([replace(m, ok=k != 3) for k, m in enumerate(found)])
     assert broken.at(350_000_000) is None
-    assert broken.step(250_000_000, 450_000_000) is None
-    assert broken.step(110_000_000, 290_000_000) is not None
-    assert broken.step(410_000_000, 690_000_000) is not None
+    assert step_of(broken, 250_000_000, 450_000_000) is None
+    assert step_of(broken, 110_000_000, 290_000_000) is not None
+    assert step_of(broken, 410_000_000, 690_000_000) is not None
     assert SensorPath([]).at(0) is None
 
 
@@ -96,11 +102,11 @@ def test_noise_between_stamps_by_simulation() -> None:
             noise = sigma * rng.standard_normal((9, 3))
             poses = [gtsam.Pose3(gtsam.Rot3.Expmap(n), np.zeros(3)) for n in noise]
             path = SensorPath(motions(lambda t, poses=poses: poses[round(10 * t)], evenly(9)))
-            step, later = path.step(a, a + PERIOD_NS), path.step(a + 1000, a + 1000 + PERIOD_NS)
+            step, later = step_of(path, a, a + PERIOD_NS), step_of(path, a + 1000, a + 1000 + PERIOD_NS)
             assert step is not None and later is not None
-            turns.append(gtsam.Rot3.Logmap(step.aTb.rotation()))
-            twists.append((gtsam.Rot3.Logmap(later.aTb.rotation()) - turns[-1]) / 1e-6)
-            claimed, of_twist = step.covariance[0, 0], step.twist_covariance[0, 0]
+            turns.append(gtsam.Rot3.Logmap(gtsam.Pose3(step.aTbs[0]).rotation()))
+            twists.append((gtsam.Rot3.Logmap(gtsam.Pose3(later.aTbs[0]).rotation()) - turns[-1]) / 1e-6)
+            claimed, of_twist = step.covariances[0, 0, 0], step.twist_covariances[0, 0, 0]
         assert np.var(turns) == pytest.approx(claimed, rel=0.15)
         assert np.var(twists) == pytest.approx(of_twist, rel=0.15)
 
@@ -109,8 +115,8 @@ def test_rate_of_the_covariance_is_its_derivative() -> None:
     path = SensorPath(motions(weaving, evenly(9)))
     for fraction in (0.1, 0.25, 0.4, 0.5, 0.8):
         a, h = round((3 + fraction) * PERIOD_NS), 10_000
-        before, here, after = (path.step(t, t + PERIOD_NS) for t in (a - h, a, a + h))
+        before, here, after = (step_of(path, t, t + PERIOD_NS) for t in (a - h, a, a + h))
         assert before is not None and here is not None and after is not None
-        slope = (after.covariance - before.covariance) / (2e-9 * h)
-        np.testing.assert_allclose(slope, here.covariance_rate, atol=1e-9)
-    assert after.covariance[0, 0] < COVARIANCE[0, 0]
+        slope = (after.covariances - before.covariances) / (2e-9 * h)
+        np.testing.assert_allclose(slope, here.covariance_rates, atol=1e-9)
+    assert after.covariances[0, 0, 0] < COVARIANCE[0, 0]

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from streets import prepared_street
 
 from sst_graph.batch import CalibrationConfig
-from sst_graph.batch.method_estimate import Guess, MethodEstimate, result_of
+from sst_graph.batch.method_estimate import MethodEstimate, result_of
 from sst_graph.drive.preparation import Drive
 from sst_graph.drive.stamp_intervals import FrameIntervals, Jump, StampMonitor, jumps_of
+from sst_graph.types import Guess
 
 CHI2 = 25.0
 PERIOD_NS = 100_000_000

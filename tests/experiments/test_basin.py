@@ -14,6 +14,7 @@ from sst_graph.cli import main
 from sst_graph.errors import ConfigError
 from sst_graph.experiments.basin import BasinConfig, BasinRun, binomial_bounds, markdown, start_anywhere
 from sst_graph.initialization.global_search import SearchConfig, SearchProblem
+from sst_graph.types import Guess
 
 CTL = gtsam.Pose3(gtsam.Rot3.Ypr(0.1, 0.2, 0.3), np.array([0.1, 0.2, 0.3]))
 
@@ -80,7 +81,7 @@ def test_a_number_is_needed_for_every_search() -> None:
 
 
 def test_the_grid_of_a_search_everywhere_repeats_no_rotation_beyond_half_a_turn() -> None:
-    problem = SearchProblem([], None, (), CTL, 0.0, SearchConfig(rotation_deg=180.0))  # type: ignore[arg-type]
+    problem = SearchProblem([], None, (), Guess(CTL), SearchConfig(rotation_deg=180.0))  # type: ignore[arg-type]
     rotations = problem.grid().rotations @ CTL.rotation().matrix().T
     axes = np.array([gtsam.Rot3.Logmap(gtsam.Rot3(R)) for R in rotations[:: len(rotations) // 500]])
     assert np.linalg.norm(axes, axis=1).max() <= np.pi + 1e-9

@@ -29,7 +29,8 @@ from sst_graph.export import (
 )
 from sst_graph.factors import Alignment, FactorError, RobustKernel, frame_factor, residuals, time_offset_prior
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.graph.building import GraphConfig, Tracks, associate, joint_graph
+from sst_graph.graph.building import joint_graph
+from sst_graph.graph.matching import GraphConfig, Tracks, associate
 from sst_graph.graph.state import State
 from sst_graph.result import CalibrationResult
 from sst_graph.simulator import SimulationConfig

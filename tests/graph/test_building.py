@@ -8,16 +8,8 @@ import pytest
 from streets import prepared_street, standing_street
 
 from sst_graph.factors import RobustKernel
-from sst_graph.graph.building import (
-    PRIOR_ROTATION_SIGMA_RAD,
-    GraphConfig,
-    PairMatches,
-    Tracks,
-    associate,
-    joint_graph,
-    state_from,
-    tracked_objects,
-)
+from sst_graph.graph.building import PRIOR_ROTATION_SIGMA_RAD, joint_graph, state_from, tracked_objects
+from sst_graph.graph.matching import GraphConfig, PairMatches, Tracks, associate
 from sst_graph.graph.state import EXTRINSIC, State, bias_key, object_bias_key, time_offset_key, twist_key
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.types import SemanticClass

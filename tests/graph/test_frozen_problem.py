@@ -13,9 +13,9 @@ from streets import prepared_street, standing_street
 from sst_graph.covariance.cluster_robust import robust_covariance
 from sst_graph.drive.preparation import Drive, ScanFeatures
 from sst_graph.factors import RobustKernel
-from sst_graph.graph.building import GraphConfig, Tracks, associate, joint_graph, state_from
+from sst_graph.graph.building import joint_graph, state_from
 from sst_graph.graph.frozen_problem import FrozenProblem, NormalEquations
-from sst_graph.graph.matching import DriveMatches, edges_of, match_all
+from sst_graph.graph.matching import DriveMatches, GraphConfig, Tracks, associate, edges_of, match_all
 from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
 from sst_graph.objects.dynamic_objects import DynamicObject
 from sst_graph.objects.tracks import ObjectId, object_tracks

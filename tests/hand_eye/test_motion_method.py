@@ -18,13 +18,14 @@ from sst_graph.cli import main
 from sst_graph.config import with_overrides
 from sst_graph.data import open_source
 from sst_graph.errors import ConfigError
-from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
+from sst_graph.graph.state import EXTRINSIC, State, difference, time_offset_key
 from sst_graph.hand_eye.graph import NoiseScales, camera_steps, hand_eye_terms, lidar_paths, pair_motions
 from sst_graph.hand_eye.initialization import motion_starts
-from sst_graph.hand_eye.solution import MotionSolution, alternative, difference, solve_motion
+from sst_graph.hand_eye.solution import MotionSolution, alternative, solve_motion
 from sst_graph.metrics import calibration_errors
 from sst_graph.result import read_result
 from sst_graph.simulator import SimulationConfig
+from sst_graph.types import Guess
 
 
 def off(degrees: float) -> gtsam.Pose3:
@@ -37,7 +38,7 @@ def error_of(solution: MotionSolution) -> np.ndarray:
 
 @pytest.mark.parametrize("guess", [None, off(20.0)])
 def test_without_noise_all_seven_come_back(guess: gtsam.Pose3 | None) -> None:
-    solution = solve_motion([made_drive(weaving, noise=0.0)], guess, 0.0)[0]
+    solution = solve_motion([made_drive(weaving, noise=0.0)], Guess(guess))[0]
     error = error_of(solution)
     assert solution.converged
     assert np.degrees(np.linalg.norm(error[:3])) < 0.1
@@ -51,7 +52,7 @@ def test_covariance_fits_the_errors() -> None:
     config = 0.06
     nees = []
     for seed in range(10):
-        solution = solve_motion([made_drive(weaving, 40, seed)], off(5.0), 0.1, config)[0]
+        solution = solve_motion([made_drive(weaving, 40, seed)], Guess(off(5.0), 0.1), config)[0]
         error, some = error_of(solution), [0, 1, 2, 6]
         nees.append(error[some] @ np.linalg.solve(solution.covariance[np.ix_(some, some)], error[some]))
     assert 0.7 < np.mean(nees) < 8.0
@@ -63,7 +64,7 @@ def test_few_pairs_do_not_widen_the_covariance_without_need() -> None:
     """Twelve frames have eleven pairs, but 55 residuals: few clusters are not few residuals."""
     nees, some = [], [0, 1, 2, 6]
     for seed in range(10):
-        solution = solve_motion([made_drive(weaving, 12, seed)], TRUE, OFFSET_S)[0]
+        solution = solve_motion([made_drive(weaving, 12, seed)], Guess(TRUE, OFFSET_S))[0]
         error = error_of(solution)
         nees.append(error[some] @ np.linalg.solve(solution.covariance[np.ix_(some, some)], error[some]))
     assert 0.45 < np.mean(nees) / len(some) < 1.6
@@ -85,7 +86,7 @@ def test_a_straight_road_leaves_the_roll_and_the_offset_open() -> None:
 
 def test_noise_is_no_turning() -> None:
     """On a straight road the LiDAR's noise alone must tell no offset, wherever between stamps it falls."""
-    found = [solve_motion([made_drive(straight, seed=seed)], TRUE, OFFSET_S)[0] for seed in range(2)]
+    found = [solve_motion([made_drive(straight, seed=seed)], Guess(TRUE, OFFSET_S))[0] for seed in range(2)]
     assert min(np.sqrt(s.covariance[6, 6]) for s in found) > 0.03
 
 
@@ -104,7 +105,7 @@ def test_too_few_frames() -> None:
 @pytest.mark.slow
 def test_two_drives_are_better_than_one() -> None:
     one, two = made_drive(weaving, seed=1), made_drive(weaving, seed=2)
-    alone, both = (solve_motion(drives, TRUE, 0.1)[0] for drives in ([one], [one, two]))
+    alone, both = (solve_motion(drives, Guess(TRUE, 0.1))[0] for drives in ([one], [one, two]))
     assert len(both.terms) == 2 * len(alone.terms)
     assert both.covariance[6, 6] < 0.8 * alone.covariance[6, 6]
 
@@ -120,7 +121,7 @@ def test_outliers_count_little() -> None:
         )
         pairs[k] = dataclasses.replace(pairs[k], direction=motion)
     spoilt = dataclasses.replace(drive, image_pairs=tuple(pairs))
-    error = error_of(solve_motion([spoilt], None, 0.0)[0])
+    error = error_of(solve_motion([spoilt], Guess(None))[0])
     assert np.degrees(np.linalg.norm(error[:3])) < 0.3 and abs(error[6]) < 3e-3
 
 
@@ -139,7 +140,7 @@ def test_noise_scales_follow_the_residuals() -> None:
 
 def test_start_without_a_guess() -> None:
     drive = made_drive(weaving)
-    starts = motion_starts(camera_steps([drive]), lidar_paths([drive]), None, 0.0)
+    starts = motion_starts(camera_steps([drive]), lidar_paths([drive]), Guess(None))
     best = starts[0]
     assert abs(best.time_offset_s - OFFSET_S) <= 0.02
     assert np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(best.cRl.between(TRUE.rotation())))) < 2.0
@@ -147,7 +148,7 @@ def test_start_without_a_guess() -> None:
 
 
 def test_an_alternative_is_another_solution_that_fits_alike() -> None:
-    best = solve_motion([made_drive(weaving)], TRUE, OFFSET_S)[0]
+    best = solve_motion([made_drive(weaving)], Guess(TRUE, OFFSET_S))[0]
     elsewhere = dataclasses.replace(
         best, state=State(best.state.cTl, (OFFSET_S - 0.1,)), cost=best.cost + 1.0
     )

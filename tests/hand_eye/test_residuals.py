@@ -37,9 +37,9 @@ def test_the_cost_is_the_sum_of_each_pairs(wTl: PoseAt) -> None:
     assert terms.residuals.directed.any() == (wTl is weaving)
     for state in (at, beside(at)):
         values = state_values(state)
-        apart = sum(term.factor.error(values) for term in terms.each())
+        apart = sum(factor.error(values) for factor in terms.each())
         assert terms.factor().error(values) == pytest.approx(apart, rel=1e-9)
-        information = sum(term.factor.linearize(values).information() for term in terms.each())
+        information = sum(factor.linearize(values).information() for factor in terms.each())
         together = terms.factor().linearize(values).information()
         np.testing.assert_allclose(together, information, rtol=1e-7, atol=1e-9 * np.abs(information).max())
 

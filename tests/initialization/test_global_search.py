@@ -29,7 +29,7 @@ from sst_graph.initialization.label_agreement import (
 )
 from sst_graph.simulator import SimulatedDrive
 from sst_graph.stepwise import run_to_end
-from sst_graph.types import SemanticClass
+from sst_graph.types import Guess, SemanticClass
 
 VEHICLE = SemanticClass.VEHICLE
 
@@ -73,7 +73,7 @@ def search(config: SearchConfig, stages: tuple[Stage, ...]) -> tuple[gtsam.Pose3
     source, frames = drive()
     turn = np.radians(15.0) * np.array([2.0, -1.0, 2.0]) / 3.0
     guess = source.truth.cTl.retract(np.concatenate([turn, [0.05, -0.05, 0.05]]))
-    problem = SearchProblem(frames, source.camera, [VEHICLE], guess, 0.0, config)
+    problem = SearchProblem(frames, source.camera, [VEHICLE], Guess(guess), config)
     return guess, run_to_end(search_steps(problem, stages))
 
 
@@ -178,7 +178,7 @@ def test_a_view_of_one_class_only_says_nothing() -> None:
 
 def test_nothing_to_search_with() -> None:
     source, frames = drive()
-    problem = SearchProblem(frames, source.camera, [SemanticClass.TWO_WHEELER], None, 0.0, SMALL)
+    problem = SearchProblem(frames, source.camera, [SemanticClass.TWO_WHEELER], Guess(None), SMALL)
     with pytest.raises(EstimationError, match="no labelled point"):
         run_to_end(search_steps(problem, STAGES))
 

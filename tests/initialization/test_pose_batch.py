@@ -14,9 +14,9 @@ from sst_graph.drive.preparation import Drive, ImageFeatures, ScanFeatures
 from sst_graph.factors import CameraTwist, PinholeCamera, RobustKernel
 from sst_graph.features.lidar_edges import Boundaries
 from sst_graph.features.mask_contour import ContourMap
-from sst_graph.graph.building import PRIOR_TRANSLATION_SIGMA_M, GraphConfig, Tracks
+from sst_graph.graph.building import PRIOR_TRANSLATION_SIGMA_M
 from sst_graph.graph.frozen_problem import FrozenProblem
-from sst_graph.graph.matching import edges_of, match_all
+from sst_graph.graph.matching import GraphConfig, Tracks, edges_of, match_all
 from sst_graph.graph.state import State
 from sst_graph.initialization.pose_batch import BatchEquations, PoseBatch, Poses
 from sst_graph.types import RelativeMotion, SemanticClass

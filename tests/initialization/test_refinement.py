@@ -7,8 +7,7 @@ import numpy as np
 from streets import prepared_street, standing_street
 
 from sst_graph.drive.preparation import Drive, PrepareConfig, prepare_drive
-from sst_graph.graph.building import GraphConfig, Tracks
-from sst_graph.graph.matching import edges_of
+from sst_graph.graph.matching import GraphConfig, Tracks, edges_of
 from sst_graph.graph.outer_loop import KERNELS_PX, JointConfig, JointProblem, solve_joint
 from sst_graph.graph.state import State
 from sst_graph.initialization.pose_batch import BatchEquations, Poses

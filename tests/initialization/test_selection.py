@@ -11,7 +11,7 @@ import pytest
 from streets import prepared_street, standing_street
 
 from sst_graph.errors import EstimationError
-from sst_graph.graph.building import Tracks
+from sst_graph.graph.matching import Tracks
 from sst_graph.graph.outer_loop import (
     KERNELS_PX,
     NARROW_KERNELS_PX,
@@ -40,7 +40,7 @@ from sst_graph.initialization.selection import (
     select_start_steps,
 )
 from sst_graph.stepwise import run_to_end
-from sst_graph.types import Calibration, SemanticClass
+from sst_graph.types import Calibration, Guess, SemanticClass
 
 VEHICLE = SemanticClass.VEHICLE
 JOINT, START = JointConfig(), SearchConfig()
@@ -48,7 +48,7 @@ JOINT, START = JointConfig(), SearchConfig()
 
 def start_problem(guess: gtsam.Pose3 | None, time_offset_s: float = 0.0) -> StartProblem:
     drives = [prepared_street()]
-    return StartProblem(drives, Tracks(drives), [VEHICLE], guess, time_offset_s)
+    return StartProblem(drives, Tracks(drives), [VEHICLE], Guess(guess, time_offset_s))
 
 
 def poses_of(cTls: list[gtsam.Pose3], offsets: list[float]) -> Poses:

@@ -12,7 +12,7 @@ import pytest
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
-from sst_graph.hand_eye.graph import PRIOR_SIGMAS, HandEyeTerm
+from sst_graph.hand_eye.graph import PRIOR_SIGMAS
 from sst_graph.inspect.gained import KEY, gained_of, pair_gains, to_document
 from sst_graph.inspect.inspection import inspect_result, to_dict
 from sst_graph.inspect.inspection_text import inspection_text
@@ -32,8 +32,8 @@ def _result(method: str, gained: Any = None) -> CalibrationResult:
     return replace(result, method=method)
 
 
-def _terms(count: int) -> tuple[list[HandEyeTerm], list[np.ndarray]]:
-    rng, terms, rows = np.random.default_rng(1), [], []
+def _factors(count: int) -> tuple[list[gtsam.NonlinearFactor], list[np.ndarray]]:
+    rng, factors, rows = np.random.default_rng(1), [], []
     values = gtsam.Values()
     values.insert(EXTRINSIC, gtsam.Pose3())
     values.insert(time_offset_key(), np.zeros(1))
@@ -41,17 +41,15 @@ def _terms(count: int) -> tuple[list[HandEyeTerm], list[np.ndarray]]:
         J = rng.normal(size=(6, 7)) * 20.0
         unit = gtsam.noiseModel.Unit.Create(6)
         linear = gtsam.JacobianFactor(EXTRINSIC, J[:, :6], time_offset_key(), J[:, 6:], np.zeros(6), unit)
-        factor: Any = gtsam.LinearContainerFactor(linear, values)
-        pair: Any = None
-        terms.append(HandEyeTerm(pair, factor, np.eye(6)))
+        factors.append(gtsam.LinearContainerFactor(linear, values))
         rows.append(J)
-    return terms, rows
+    return factors, rows
 
 
 def test_a_pair_is_worth_what_the_others_lack_without_it() -> None:
-    terms, rows = _terms(3)
+    factors, rows = _factors(3)
     frames = [FrameId("a", k) for k in range(3)]
-    gained = pair_gains(terms, frames, State(gtsam.Pose3()))
+    gained = pair_gains(factors, frames, State(gtsam.Pose3()))
     H = np.diag(PRIOR_SIGMAS**-2.0) + sum(J.T @ J for J in rows)
     for gain, J in zip(gained.gains, rows, strict=True):
         rest = H - J.T @ J

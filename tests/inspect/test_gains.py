@@ -14,16 +14,9 @@ from sst_graph.covariance.error_model import ErrorModel, fit_error_model
 from sst_graph.covariance.match_table import MatchTable, match_table
 from sst_graph.drive.preparation import Drive, PrepareConfig, prepare_drive
 from sst_graph.factors import RobustKernel
-from sst_graph.graph.building import (
-    PRIOR_ROTATION_SIGMA_RAD,
-    PRIOR_TRANSLATION_SIGMA_M,
-    GraphConfig,
-    PairMatches,
-    Tracks,
-    associate,
-    joint_graph,
-)
+from sst_graph.graph.building import PRIOR_ROTATION_SIGMA_RAD, PRIOR_TRANSLATION_SIGMA_M, joint_graph
 from sst_graph.graph.elimination import Unknowns, marginal_covariance
+from sst_graph.graph.matching import GraphConfig, PairMatches, Tracks, associate
 from sst_graph.graph.state import State
 from sst_graph.inspect.frame_gains import frame_gains
 from sst_graph.inspect.frame_information import FrameInformation

@@ -11,7 +11,8 @@ from stored import simulated
 from sst_graph.covariance.cluster_robust import robust_covariance
 from sst_graph.drive.preparation import PrepareConfig, prepare_drive
 from sst_graph.factors import RobustKernel
-from sst_graph.graph.building import PairMatches, Tracks, associate, joint_graph, state_from
+from sst_graph.graph.building import joint_graph, state_from
+from sst_graph.graph.matching import PairMatches, Tracks, associate
 from sst_graph.graph.outer_loop import KERNELS_PX, JointConfig, JointProblem, solve_joint
 from sst_graph.graph.state import State
 from sst_graph.inspect.frame_gains import frame_gains

@@ -14,7 +14,6 @@ from streets import CROWDED_STREET, crowded_street
 
 from sst_graph.batch import CalibrationConfig
 from sst_graph.batch.calibrate import prepare_drives
-from sst_graph.batch.method_estimate import Guess
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.drive.preparation import Drive
 from sst_graph.fit import Fit, FitQuality
@@ -23,6 +22,7 @@ from sst_graph.graph.state import State
 from sst_graph.quality import fit_of_solution
 from sst_graph.quality.fit_of_solution import FitOfDrives
 from sst_graph.quality.profiles import profiles
+from sst_graph.types import Guess
 
 CONFIG = CalibrationConfig(use_motion="never")
 

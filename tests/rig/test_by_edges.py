@@ -12,14 +12,13 @@ import pytest
 
 from sst_graph import CalibrationConfig
 from sst_graph.batch.by_edges.choice import with_method_for_cameras
-from sst_graph.batch.method_estimate import Guess
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.rig import KnownPose, KnownRig
 from sst_graph.rig.calibrate import calibrate_rig_prepared, prepare_rig
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
 from sst_graph.simulator.rig import beside, stereo_pose, with_mounts
-from sst_graph.types import SemanticClass
+from sst_graph.types import Guess, SemanticClass
 
 STREET = SimulationConfig(seed=507, frames=14, motion="turning", azimuth_limit_deg=50.0)
 START = np.array([*np.radians([2.0, -1.5, 2.0]), 0.05, -0.05, 0.05])

@@ -12,7 +12,6 @@ import pytest
 from stored import stored
 
 from sst_graph import CalibrationConfig, calibrate
-from sst_graph.batch.method_estimate import Guess
 from sst_graph.config import with_overrides
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.errors import ConfigError, DataError, SstGraphError
@@ -23,7 +22,7 @@ from sst_graph.rig.adjustment import adjusted
 from sst_graph.rig.calibrate import calibrate_rig_prepared, prepare_rig
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
 from sst_graph.simulator.rig import beside, stereo_pose, with_mounts
-from sst_graph.types import CameraImage, Scan, SemanticClass
+from sst_graph.types import CameraImage, Guess, Scan, SemanticClass
 
 STREET = SimulationConfig(
     seed=5000,

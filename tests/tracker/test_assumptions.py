@@ -22,7 +22,8 @@ from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import ImageFeatures, prepare_drive
 from sst_graph.errors import ConfigError
 from sst_graph.experiments.wrong_drives import with_distortion, with_principal_point
-from sst_graph.graph.building import Tracks, joint_graph
+from sst_graph.graph.building import joint_graph
+from sst_graph.graph.matching import Tracks
 from sst_graph.graph.outer_loop import JointProblem, solve_joint
 from sst_graph.graph.state import State, nuisance_key
 from sst_graph.objects.tracks import object_tracks

@@ -15,7 +15,7 @@ from sst_graph.covariance.sums import ScoreSums
 from sst_graph.tracker.config import AlarmConfig, TrackerConfig
 from sst_graph.tracker.monitor.adoption import Adoption
 from sst_graph.tracker.monitor.confirmation import Confirmation, steps
-from sst_graph.tracker.monitor.statistic import ChangeStatistic, Comparison, EstimateCovariance
+from sst_graph.tracker.monitor.statistic import ChangeStatistic, ComparedEstimate, EstimateCovariance
 from sst_graph.tracker.sums.linearized_pair import LinearizedPair
 from sst_graph.tracker.sums.running_sums import RunningSums
 from sst_graph.tracker.window.gaussian import Gaussian, Point, insert_point
@@ -105,8 +105,12 @@ def _model() -> ErrorModel:
     return ErrorModel(0.25, 0.0, 1.0)
 
 
+def _compared(covariance: EstimateCovariance) -> ComparedEstimate:
+    return ComparedEstimate(Point(gtsam.Pose3(), 0.0, np.zeros(2)), covariance, _model())
+
+
 def _chi2(scores: list[LinearizedPair], covariance: EstimateCovariance) -> float:
-    return Comparison.of(scores, covariance, _model(), 0.0).chi2()
+    return ChangeStatistic(25.0).compare(scores, _compared(covariance)).chi2()
 
 
 def test_the_statistic_is_chi_square_where_nothing_changed() -> None:
@@ -121,16 +125,15 @@ def test_the_statistic_is_chi_square_where_nothing_changed() -> None:
 
 def test_a_step_raises_the_alarm_and_quiet_does_not() -> None:
     rng, P = np.random.default_rng(2), 1e-4 * np.eye(N)
-    statistic = ChangeStatistic(25.0)
+    statistic, quiet = ChangeStatistic(25.0), _compared(EstimateCovariance(P, (), N))
     for k in range(200):
-        statistic.add([_score(rng, np.zeros(N), 4 * k)], EstimateCovariance(P, (), N), _model())
+        statistic.add([_score(rng, np.zeros(N), 4 * k)], quiet)
         assert not statistic.confirmed
     step = np.full(N, 0.3)
     raised = [
         k
         for k in range(10)
-        if statistic.add([_score(rng, step, 9000 + 4 * k)], EstimateCovariance(P, (), N), _model())
-        and statistic.confirmed
+        if statistic.add([_score(rng, step, 9000 + 4 * k)], quiet) and statistic.confirmed
     ]
     assert raised and raised[0] < 8
 
@@ -143,7 +146,7 @@ def test_steps_that_would_be_detected_are_predicted() -> None:
     scores = [_score(rng, np.zeros(N), 4 * k) for k in range(4)]
     exact = EstimateCovariance(np.zeros((N, N)), (), N)
     statistic = ChangeStatistic(25.0)
-    compared = statistic.compare(scores, exact, _model())
+    compared = statistic.compare(scores, _compared(exact))
     small, large = compared.chi2_of(tried)
     assert small < 5.0 < 50.0 < large
     assert statistic.detectable(compared, tried).tolist() == [False, True]

@@ -13,7 +13,7 @@ from sst_graph.files.object_store import stored
 from sst_graph.simulator import SimulatedDrive
 from sst_graph.stepwise import Stepwise, run_to_end
 from sst_graph.tracker.spread_work import Run
-from sst_graph.tracker.start.first_estimate import Guess
+from sst_graph.tracker.start.first_estimate import StartGuess
 from sst_graph.tracker.start.solution import first_estimate_steps
 from sst_graph.tracker.storage.snapshot import Snapshot
 from sst_graph.types import Frame
@@ -85,7 +85,7 @@ def test_each_step_of_a_start_is_small(street: SimulatedDrive, frames: list[Fram
     for frame in frames[:11]:
         tracker.add(frame)
     drive, _ = tracker.inputs.window.drive()
-    steps = list(first_estimate_steps(drive, Guess(street.nominal, 0.0), tracker.setup.config))
+    steps = list(first_estimate_steps(drive, StartGuess(street.nominal, 0.0), tracker.setup.config))
     assert max(steps) <= 12 and len(steps) > 100
 
 

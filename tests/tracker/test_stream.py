@@ -13,7 +13,8 @@ from streets import EARLY_START, saved_tracker, sigmas_apart, tracker_from_truth
 from sst_graph import Tracker
 from sst_graph.covariance.cluster_robust import robust_covariance
 from sst_graph.errors import DataError, EstimationError
-from sst_graph.graph.building import Tracks, associate, joint_graph, state_from
+from sst_graph.graph.building import joint_graph, state_from
+from sst_graph.graph.matching import Tracks, associate
 from sst_graph.inspect.gained import gained_of
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.result import CalibrationResult

@@ -15,12 +15,13 @@ from sst_graph.covariance.cluster_robust import (
 from sst_graph.covariance.jackknife import ObjectSpread, composed
 from sst_graph.drive.preparation import PrepareConfig, prepare_drive
 from sst_graph.factors import RobustKernel
-from sst_graph.graph.building import GraphConfig, Tracks, associate, joint_graph
+from sst_graph.graph.building import joint_graph
 from sst_graph.graph.linear import unit_scale
+from sst_graph.graph.matching import GraphConfig, Tracks, associate
 from sst_graph.graph.state import EXTRINSIC, State, bias_key, object_bias_key, time_offset_key
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.simulator import SimulationConfig
-from sst_graph.tracker.monitor.statistic import ChangeStatistic, EstimateCovariance
+from sst_graph.tracker.monitor.statistic import ChangeStatistic, ComparedEstimate, EstimateCovariance
 from sst_graph.tracker.sums.linearized_pair import LinearizedPair, PairColumns, linearize_pair
 from sst_graph.tracker.sums.running_sums import RunningSums
 from sst_graph.tracker.window.gaussian import Point
@@ -100,8 +101,7 @@ def test_the_sums_are_the_batch_s(
     objects = [pair.objects for pair in window if pair.objects is not None]
     spread = sums.objects.spread(objects, naive, point)
     steps = steps_without_objects(robust.table, robust.bread)
-    weights = np.asarray(np.bincount(robust.table.objects, robust.table.root_weights**2), np.float64)
-    of_batch = ObjectSpread.of(steps, weights)
+    of_batch = ObjectSpread.of(steps, robust.table.object_weights)
     assert spread.number == pytest.approx(of_batch.number, rel=1e-9)
     by_model = naive + naive @ sums.excess(window, own, model) @ naive
     exact = composed(by_model[np.ix_(columns, columns)], of_batch, ratio)[:7, :7]
@@ -117,13 +117,14 @@ def test_parts_of_frames_are_compared_as_each_by_itself(
 ) -> None:
     _, point, linear = matched
     model = RunningSums.empty(point.size).error_model(linear)
-    known = EstimateCovariance(1e-6 * np.eye(point.size), point.tracks, point.core_size)
+    covariance = EstimateCovariance(1e-6 * np.eye(point.size), point.tracks, point.core_size)
+    known = ComparedEstimate(point, covariance, model)
     statistic, n = ChangeStatistic(25.0, 0.5), len(linear)
     parts = [(0, 2), (2, n), (n - 3, n), (1, n - 1)]
-    alone = [statistic.normalized(statistic.compare(linear[a:b], known, model)) for a, b in parts]
+    alone = [statistic.normalized(statistic.compare(linear[a:b], known)) for a, b in parts]
     assert len({round(value, 6) for value in alone}) == len(parts)
     for part, value in zip(parts, alone, strict=True):
-        found = statistic.largest_of_parts(linear, [part], known, model)
+        found = statistic.largest_of_parts(linear, [part], known)
         assert found == pytest.approx(value, rel=1e-9)
-    assert statistic.largest_of_parts(linear, parts, known, model) == pytest.approx(max(alone), rel=1e-9)
-    assert statistic.largest_of_parts(linear, [(1, 1)], known, model) == 0.0
+    assert statistic.largest_of_parts(linear, parts, known) == pytest.approx(max(alone), rel=1e-9)
+    assert statistic.largest_of_parts(linear, [(1, 1)], known) == 0.0

@@ -13,12 +13,13 @@ from sst_graph.batch.by_edges.label_parts import split_by_labels
 from sst_graph.batch.by_edges.method import edges_method
 from sst_graph.batch.by_edges.problem import LabelEstimate
 from sst_graph.batch.config import CalibrationConfig
-from sst_graph.batch.method_estimate import Guess, MethodEstimate
+from sst_graph.batch.method_estimate import MethodEstimate
 from sst_graph.batch.motion_factor import MAX_DISAGREEMENT_CHI2
 from sst_graph.covariance.undecided_sweep import MATTERS
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import EstimationError
 from sst_graph.inspect.frame_information import KEY as FRAME_INFORMATION
+from sst_graph.types import Guess
 
 ByLabels = Callable[[Sequence[Drive], Guess, CalibrationConfig, Progress | None], MethodEstimate]
 

@@ -31,13 +31,12 @@ from sst_graph.batch.by_edges.parts import thinned, with_objects, without_kind
 from sst_graph.batch.by_edges.positions import considered_positions
 from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX, solution_steps
 from sst_graph.batch.problem import JointEstimate
-from sst_graph.covariance.considered import AssumptionConfig, considered_by_matches
+from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.covariance.shared_errors import FEWEST, SharedErrors, spread_covariance, with_estimate
 from sst_graph.errors import EstimationError
 from sst_graph.features.lidar_edges import Edge
 from sst_graph.graph.outer_loop import JointProblem
-from sst_graph.graph.state import State
-from sst_graph.hand_eye.solution import difference
+from sst_graph.graph.state import State, difference
 from sst_graph.objects.tracks import ObjectId
 from sst_graph.stepwise import Stepwise, run_to_end
 
@@ -108,10 +107,8 @@ def edges_covariance(
     # 1. What differs from object to object.
     steps, parameter_steps = run_to_end(half_sample_steps(problem, solution.state, objects))
     # 2. What all of them have in common.
-    considered = considered_by_matches(
-        estimate.robust, solution.pairs, solution.values, solution.state, assumptions
-    )
-    considered = with_test_results(considered, [each for each in tests if not each.contradicted])
+    open_ = [each for each in tests if not each.contradicted]
+    considered = with_test_results(estimate.considered(assumptions), open_)
     positions = considered_positions(estimate, problem.config.graph)
     outlines = run_to_end(outline_steps(problem, solution.state))
     parts = {

@@ -17,14 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.batch.method_estimate import MethodEstimate
-from sst_graph.graph.state import State
-from sst_graph.hand_eye.solution import difference
+from sst_graph.batch.motion_factor import UNLIKELY_CHI2
+from sst_graph.graph.state import State, difference
 
 FloatArray = NDArray[np.float64]
-
-UNLIKELY_CHI2 = 14.07
-"""95 % quantile of chi-squared with 7 degrees of freedom: beyond it the covariance grows by Birge's ratio,
-squared."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +61,7 @@ class Fused:
         covariance += by_sweeps
         if chi2 > UNLIKELY_CHI2:
             covariance *= chi2 / 7.0
-        state = State(a.cTl.retract(moved[:6]), (a.time_offsets_s[0] + float(moved[6]),))
-        return cls(state, 0.5 * (covariance + covariance.T), 2.0 * by_sweeps, gain, step, chi2)
+        return cls(a.moved(moved), 0.5 * (covariance + covariance.T), 2.0 * by_sweeps, gain, step, chi2)
 
 
 def state_of(estimate: MethodEstimate) -> State:

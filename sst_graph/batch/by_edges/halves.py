@@ -19,13 +19,13 @@ from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX
 from sst_graph.batch.contradictions import FALSE_ALARM
 from sst_graph.covariance.contradiction import Difference, PartEstimate, name_step
 from sst_graph.edges.agreement import score
-from sst_graph.edges.search import SearchRegion, edge_starts
+from sst_graph.edges.search import SearchRegion, edge_starts_steps
 from sst_graph.errors import EstimationError
 from sst_graph.graph.matching import edges_of
 from sst_graph.graph.outer_loop import JointProblem, solve_joint
-from sst_graph.graph.state import State
-from sst_graph.hand_eye.solution import difference
+from sst_graph.graph.state import State, difference
 from sst_graph.sampling import evenly_spread
+from sst_graph.stepwise import run_to_end
 
 FloatArray = NDArray[np.float64]
 
@@ -81,7 +81,8 @@ def _half(
         return None
     # 1. Every start on a few scans.
     region = SearchRegion(state.cTl, state.time_offsets_s[:1], (_HALF_DEG,) * 3)
-    starts = [state, *(replace(state, cTl=start.cTl) for start in edge_starts(edges[0], region))]
+    searched = run_to_end(edge_starts_steps(edges[0], region))
+    starts = [state, *(replace(state, cTl=start.cTl) for start in searched)]
     found: list[tuple[float, State]] = []
     for start in starts:
         try:

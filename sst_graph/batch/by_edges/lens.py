@@ -27,8 +27,7 @@ from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.covariance.shared_errors import FEWEST
 from sst_graph.errors import EstimationError
 from sst_graph.graph.outer_loop import JointProblem
-from sst_graph.graph.state import State
-from sst_graph.hand_eye.solution import difference
+from sst_graph.graph.state import State, difference
 from sst_graph.objects.tracks import ObjectId
 from sst_graph.stepwise import Stepwise
 

@@ -17,13 +17,15 @@ from sst_graph.batch.by_edges.problem import LabelEstimate, edges_problem, motio
 from sst_graph.batch.by_edges.reasons import EdgeContrast, edge_contrast, edges_reasons, wider_kernel_reasons
 from sst_graph.batch.by_edges.solution import WIDER_KERNEL_PX
 from sst_graph.batch.config import CalibrationConfig
-from sst_graph.batch.method_estimate import Guess, MethodEstimate, frames_used
+from sst_graph.batch.method_estimate import MethodEstimate, frames_used
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.batch.total_covariance import sweep_effects
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.graph.outer_loop import JointSolution, solve_joint
-from sst_graph.hand_eye.solution import MotionSolution, difference
+from sst_graph.graph.state import difference
+from sst_graph.hand_eye.solution import MotionSolution
 from sst_graph.stepwise import run_to_end
+from sst_graph.types import Guess
 
 
 def edges_method(

@@ -19,8 +19,7 @@ from sst_graph.edges.search import edge_starts_steps, turned
 from sst_graph.errors import EstimationError
 from sst_graph.graph.matching import edges_of
 from sst_graph.graph.outer_loop import JointProblem, JointSolution
-from sst_graph.graph.state import State
-from sst_graph.hand_eye.solution import difference
+from sst_graph.graph.state import State, difference
 from sst_graph.stepwise import Stepwise
 
 START_KERNELS_PX = (10.0, 8.0, 6.0, 5.0, 4.0, 3.0)
@@ -66,7 +65,7 @@ def starts_steps(problem: EdgesProblem) -> Stepwise[list[State]]:
     found = yield from edge_starts_steps(richest, problem.region)
     if not found:
         raise EstimationError("no LiDAR edge in any picture")
-    return [State(start.cTl, (start.time_offset_s,)) for start in found]
+    return found
 
 
 def refined_steps(

@@ -14,18 +14,17 @@ from numpy.typing import NDArray
 from sst_graph.association.time_pairing import pair_by_time
 from sst_graph.batch.by_edges.parts import thinned
 from sst_graph.batch.config import CalibrationConfig
-from sst_graph.batch.method_estimate import Guess
 from sst_graph.batch.motion_factor import gaussian_factor
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.edges.search import KnownRotation, SearchRegion, angle_deg
 from sst_graph.errors import EstimationError
-from sst_graph.graph.building import Tracks
-from sst_graph.graph.matching import DriveEdges, edges_of
+from sst_graph.graph.matching import DriveEdges, Tracks, edges_of
 from sst_graph.graph.outer_loop import JointProblem
-from sst_graph.graph.state import State
+from sst_graph.graph.state import State, difference
 from sst_graph.hand_eye.solution import MotionSolution, alternative, solve_motion
 from sst_graph.sampling import evenly_spread
+from sst_graph.types import Guess
 
 FloatArray = NDArray[np.float64]
 
@@ -108,7 +107,7 @@ def motion_alone(
     """What motion says; None where it says nothing, two things, or what the guess rules out."""
     reach_s = config.search.time_offset_s
     try:
-        solutions = solve_motion(drives, guess.cTl, guess.time_offset_s, reach_s, progress)
+        solutions = solve_motion(drives, guess, reach_s, progress)
     except EstimationError:
         return None
     possible = [
@@ -215,13 +214,9 @@ def _prior(centre: State, motion: MotionSolution | None, guessed: bool) -> Known
     information, state = np.diag(sigmas**-2.0), centre
     if motion is not None:
         own = np.linalg.inv(motion.covariance + np.diag(_MOTION_FLOOR**2))
-        step = np.append(
-            gtsam.Pose3.Logmap(motion.state.cTl.between(centre.cTl)),
-            centre.time_offsets_s[0] - motion.state.time_offsets_s[0],
-        )
         total = information + own
         # Both Gaussians in the tangent space of motion's estimate.
-        mean = np.linalg.solve(total, information @ step)
-        state = State(motion.state.cTl.retract(mean[:6]), (motion.state.time_offsets_s[0] + float(mean[6]),))
+        step = np.linalg.solve(total, information @ difference(motion.state, centre))
+        state = motion.state.moved(np.asarray(step, np.float64))
         information = total
     return KnownCalibration(state, np.asarray(np.linalg.inv(information), np.float64))

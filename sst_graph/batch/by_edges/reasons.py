@@ -13,8 +13,8 @@ from sst_graph.edges.agreement import score
 from sst_graph.edges.search import angle_deg, turned
 from sst_graph.graph.matching import DriveEdges
 from sst_graph.graph.outer_loop import JointSolution
-from sst_graph.graph.state import State
-from sst_graph.hand_eye.solution import MotionSolution, difference
+from sst_graph.graph.state import State, difference
+from sst_graph.hand_eye.solution import MotionSolution
 from sst_graph.stepwise import Stepwise, run_to_end
 
 FloatArray = NDArray[np.float64]

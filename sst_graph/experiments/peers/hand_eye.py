@@ -30,8 +30,8 @@ def solve_hand_eye(problem: PeerProblem, start: gtsam.Pose3) -> gtsam.Pose3:
     pairs = pair_motions(camera_steps([problem.drive]), lidar_paths([problem.drive]), problem.time_offset_s)
     if len(pairs) < _FEWEST:
         raise EstimationError(f"{len(pairs)} pairs of motions, {_FEWEST} are needed")
-    of_camera = np.array([gtsam.Rot3.Logmap(pair.camera.rotation) for pair in pairs])
-    of_lidar = np.array([gtsam.Rot3.Logmap(pair.lidar.aTb.rotation()) for pair in pairs])
+    of_camera = np.array([camera.turned for camera in pairs.cameras])
+    of_lidar = np.array([gtsam.Rot3.Logmap(gtsam.Rot3(aTb[:3, :3])) for aTb in pairs.lidars.aTbs])
     return gtsam.Pose3(park_martin(of_camera, of_lidar), start.translation())
 
 

@@ -7,8 +7,6 @@ from collections.abc import Collection
 
 import numpy as np
 
-from sst_graph.batch.by_edges.parts import thinned_scan
-from sst_graph.batch.by_edges.problem import POINTS_A_SCAN
 from sst_graph.drive.preparation import Drive, ScanFeatures
 from sst_graph.types import SemanticClass
 
@@ -40,11 +38,6 @@ def both_kinds(scan: ScanFeatures) -> ScanFeatures:
         offsets_s=np.concatenate([scan.offsets_s, edges.offsets_s[own]]),
         by_geometry=None,
     )
-
-
-def thinned_edges(scan: ScanFeatures) -> ScanFeatures:
-    """A scan with no more boundary points of objects without a class than are matched."""
-    return thinned_scan(scan, POINTS_A_SCAN, (SemanticClass.OBJECT,))
 
 
 def of_kind(drive: Drive, edges: bool) -> Drive:

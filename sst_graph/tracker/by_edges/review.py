@@ -20,8 +20,7 @@ from sst_graph.batch.by_edges.solution import WIDER_KERNEL_PX, solution_steps
 from sst_graph.covariance.shared_errors import spread_covariance
 from sst_graph.graph.matching import edges_of
 from sst_graph.graph.outer_loop import JointProblem
-from sst_graph.graph.state import State
-from sst_graph.hand_eye.solution import difference
+from sst_graph.graph.state import State, difference
 from sst_graph.objects.tracks import ObjectId
 from sst_graph.sampling import evenly_spread
 from sst_graph.stepwise import Stepwise

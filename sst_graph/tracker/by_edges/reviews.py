@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import replace
 
 import gtsam
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from sst_graph.batch.by_edges.covariance import FEW_OBJECTS, FLOOR
 from sst_graph.batch.by_edges.problem import KnownCalibration
 from sst_graph.batch.by_edges.reasons import far_reasons
-from sst_graph.graph.building import Tracks
+from sst_graph.graph.matching import Tracks
 from sst_graph.graph.outer_loop import JointProblem
 from sst_graph.graph.state import State
 from sst_graph.stepwise import Stepwise
@@ -102,12 +101,6 @@ class EdgeReviews:
         if _by_edges(smoother):
             self.review = self._new(matcher, smoother)
             self._done(None, matcher, guess)
-
-    def catch_up(self) -> None:
-        """Repeat the work that a stored review had done."""
-        if self.review is not None:
-            with suppress(*NUMERICAL_ERRORS):
-                self.review.advance(0)
 
     def covariance(self, smoother: WindowSmoother, uncertainty: Uncertainty) -> FloatArray:
         """(7, 7) covariance by what all edges have in common, and by which of them are met.

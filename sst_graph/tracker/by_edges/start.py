@@ -7,27 +7,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from sst_graph.batch.by_edges.optimum import (
-    RESTARTS,
-    best_optimum_steps,
-    refined_steps,
-    starts_steps,
-)
-from sst_graph.batch.by_edges.problem import (
-    LabelEstimate,
-    edges_problem,
-    motion_alone,
-)
+from sst_graph.batch.by_edges.optimum import RESTARTS, best_optimum_steps, refined_steps, starts_steps
+from sst_graph.batch.by_edges.problem import LabelEstimate, edges_problem, motion_alone
 from sst_graph.batch.by_edges.reasons import edge_contrast_steps, edges_reasons
-from sst_graph.batch.method_estimate import Guess as BatchGuess
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.errors import EstimationError
-from sst_graph.graph.building import Tracks
-from sst_graph.graph.state import State
+from sst_graph.graph.matching import Tracks
 from sst_graph.stepwise import Stepwise
 from sst_graph.tracker.by_edges.review import EdgeReview, review_steps
 from sst_graph.tracker.config import TrackerConfig
-from sst_graph.tracker.start.first_estimate import FirstEstimate, Guess, Stretch
+from sst_graph.tracker.start.first_estimate import FirstEstimate, StartGuess, Stretch
 from sst_graph.tracker.window.gaussian import Point
 
 _MOTION_WORK = 30
@@ -37,7 +26,7 @@ _START_SIGMAS = np.array([*np.radians([0.2] * 3), 0.03, 0.03, 0.03, 0.01])
 
 
 def first_edge_estimate_steps(
-    stretch: Stretch, guess: Guess, config: TrackerConfig
+    stretch: Stretch, guess: StartGuess, config: TrackerConfig
 ) -> Stepwise[FirstEstimate]:
     """The batch solution of some scans by edges, step by step.
 
@@ -46,12 +35,11 @@ def first_edge_estimate_steps(
     """
     calibration, drive = config.calibration, stretch.drive
     # 1. What motion says, before any edge is compared.
-    near = BatchGuess(guess.cTl, guess.time_offset_s)
-    motion = motion_alone([drive], near, calibration, None)
+    motion = motion_alone([drive], guess, calibration, None)
     yield _MOTION_WORK
     # 2. Starts by a search, refined; the best optimum.
     tracks = Tracks([drive]).with_objects(stretch.tracks, stretch.dynamic)
-    whole = CalibrationProblem([drive], tracks, [dict(stretch.tracks)], near, calibration)
+    whole = CalibrationProblem([drive], tracks, [dict(stretch.tracks)], guess, calibration)
     problem = edges_problem(whole, motion, LabelEstimate())
     starts = yield from starts_steps(problem)
     candidates = yield from refined_steps(problem, starts)
@@ -61,17 +49,11 @@ def first_edge_estimate_steps(
     others = [one.state for _, one in candidates]
     contrast = yield from edge_contrast_steps(problem.subset_edges, state, others, calibration.seed)
     reasons = edges_reasons(solution, contrast, motion, np.diag(_START_SIGMAS**2), problem.centre)
+    names = [name for name, _ in calibration.assumptions.estimated]
+    point = Point.of_state(state, calibration.classes, names)
     if stretch.at_end:
-        return FirstEstimate(_point(state, config), problem.known, EdgeReview(reasons), reviewed=False)
+        return FirstEstimate(point, problem.known, EdgeReview(reasons), reviewed=False)
     review = yield from review_steps(problem.whole, state, stretch.tracks, calibration.seed)
     if reasons := tuple(dict.fromkeys((*reasons, *review.reasons))):
         raise EstimationError("; ".join(reasons))
-    return FirstEstimate(_point(state, config), problem.known, review)
-
-
-def _point(state: State, config: TrackerConfig) -> Point:
-    calibration = config.calibration
-    names = tuple(name for name, _ in calibration.assumptions.estimated)
-    biases = [state.biases_px.get((0, c), 0.0) for c in calibration.classes]
-    parameters = np.array([state.nuisances.get(name, 0.0) for name in names])
-    return Point(state.cTl, state.time_offset_s(0), np.array(2 * biases), names=names, parameters=parameters)
+    return FirstEstimate(point, problem.known, review)

@@ -3,17 +3,11 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
-from sst_graph.association.edge_matching import GATE
-from sst_graph.drive.preparation import Drive, boundary_count
-from sst_graph.factors import alignment_cost
-from sst_graph.factors.robust import RobustKernel
-from sst_graph.graph.building import GraphConfig, PairMatches, Tracks, associate
 from sst_graph.tracker.window.gaussian import Point
-from sst_graph.types import SemanticClass
 
 _FRAMES = 10
 """Held-out frames on which the candidate and the calibration in use are compared."""
@@ -70,40 +64,3 @@ class Adoption:
             return False
         self.adopted = candidate
         return True
-
-
-def held_out_cost(
-    drive: Drive,
-    tracks: Tracks,
-    point: Point,
-    classes: tuple[SemanticClass, ...],
-    kernel: RobustKernel,
-    config: GraphConfig,
-) -> float | None:
-    """Mean robust cost of the boundary points of frames that took no part; None where none is in view.
-
-    A point that finds no contour costs as much as the farthest match.
-    """
-    pairs = associate([drive], tracks, point.state(classes), kernel, config)
-    counted = [(pair, boundary_count(drive.scans[pair.pair.scan], config.lower_edges)) for pair in pairs]
-    return mean_cost(counted, point, classes, kernel)
-
-
-def mean_cost(
-    pairs: Sequence[tuple[PairMatches, int]],
-    point: Point,
-    classes: tuple[SemanticClass, ...],
-    kernel: RobustKernel,
-) -> float | None:
-    """Mean robust cost of boundary points, given each pair's matches and number of boundary points."""
-    cost, count = 0.0, 0
-    for pair, total in pairs:
-        own = next((matches.alignment.kernel for matches in pair.matches.values()), kernel)
-        count += total
-        cost += float(own.loss(GATE * own.scale)) * (total - len(pair))
-        for c, matches in pair.matches.items():
-            bias = float(point.biases_px[classes.index(c)])
-            cost += alignment_cost(
-                matches.alignment, point.cTl, point.time_offset_s, pair.motion.c_twist, bias
-            )
-    return cost / count if count else None

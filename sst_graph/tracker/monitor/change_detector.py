@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sst_graph.covariance.error_model import ErrorModel
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.monitor.confirmation import (
@@ -28,7 +29,8 @@ from sst_graph.tracker.monitor.statistic import (
     ComparedEstimate,
     EstimateCovariance,
 )
-from sst_graph.tracker.sums.linearized_pair import LinearizedPair
+from sst_graph.tracker.start.first_estimate import StartGuess
+from sst_graph.tracker.start.initializer import Restart
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.tracker.window.matcher import WindowMatcher
 
@@ -73,20 +75,9 @@ class Reference:
     covariance: EstimateCovariance
     scan: int
 
-
-@dataclass(frozen=True)
-class Change:
-    """The calibration has changed.
-
-    Attributes:
-        near: estimate from before the change.
-        scans: how many of the latest scans are surely from after it.
-        far: objects do not meet their labels at all: the new calibration may be anywhere.
-    """
-
-    near: Point
-    scans: int
-    far: bool
+    def compared(self, model: ErrorModel) -> ComparedEstimate:
+        """For frames whose residuals have some variances."""
+        return ComparedEstimate(self.point, self.covariance, model)
 
 
 class ChangeDetector:
@@ -218,8 +209,7 @@ class ChangeDetector:
         return self.statistic.largest_of_parts(
             [score for own in scores for score in own],
             {(place[a], place[b]) for a, b in parts},
-            estimate.covariance,
-            estimate.model,
+            estimate,
         )
 
     # ------------------------------------------------------------------ new frames
@@ -254,7 +244,7 @@ class ChangeDetector:
         self._before.append(Reference(estimate.point, estimate.covariance, min(views)))
         against = self.reference or self._before[-1]
         scores = self.matcher.linearized_at(against.point, list(views), _KERNEL, self._moving)
-        value = self.statistic.add(scores, against.covariance, estimate.model)
+        value = self.statistic.add(scores, against.compared(estimate.model))
         # 3. Keep the reference, or discard it.
         if self.statistic.exceeded > self.max_pending:
             self.confirmation.unreliable |= self.matcher.objects_of(self.scans) - self._moving
@@ -268,22 +258,29 @@ class ChangeDetector:
             self._confirm(estimate)
         return value
 
-    def change(self, estimate: ComparedEstimate) -> Change | None:
-        """The change that is certain from the frames so far; one that is only suspected is noted.
+    def change(self, estimate: ComparedEstimate, chi2: float | None) -> Restart | None:
+        """The restart after a change that is certain from the frames so far; one that is only suspected is
+        noted.
 
         Args:
             estimate: the running one.
+            chi2: the statistic of the latest frames.
         """
         self.suspected_change = ""
         if self.lost:
-            return Change(estimate.point, _LOST_FRAMES, self.far)
+            return self._restart(estimate.point, _LOST_FRAMES, chi2)
         if self.statistic.confirmed:
             if self.reference is not None and self._contradicted(self.reference, estimate):
-                return Change(self.reference.point, self.statistic.exceeded, self.far)
+                return self._restart(self.reference.point, self.statistic.exceeded, chi2)
             self.suspected_change = "a single object contradicts the calibration: a step, or wrong labels"
         elif self.far:
             self.suspected_change = "what ought to be in view does not meet the image's labels"
         return None
+
+    def _restart(self, before: Point, scans: int, chi2: float | None) -> Restart:
+        """From the estimate before a change, with the latest scans, which are surely from after it."""
+        near = StartGuess(before.cTl, before.time_offset_s, search=self.far)
+        return Restart(near, scans, "the calibration has changed", True, chi2)
 
     @property
     def lost(self) -> bool:
@@ -293,7 +290,8 @@ class ChangeDetector:
 
     @property
     def far(self) -> bool:
-        """Whether the latest frames do not meet the image's labels: a change is a large one then."""
+        """Whether the latest frames do not meet the image's labels at all: a change is a large one then, and
+        the new calibration may be anywhere."""
         return self._is_unmatched(CONFIRMATIONS)
 
     def before(self, scan: int) -> Point | None:
@@ -322,7 +320,7 @@ class ChangeDetector:
             scores = self.matcher.linearized_at(estimate.point, latest, _KERNEL, {*unreliable, *self._moving})
             comparison = None
             if scores:
-                comparison = self.statistic.compare(scores, estimate.covariance, estimate.model)
+                comparison = self.statistic.compare(scores, estimate)
                 if self.statistic.normalized(comparison) > self.config.chi2:
                     return
         if comparison is not None:
@@ -338,12 +336,11 @@ class ChangeDetector:
         """
         scans = [scan for scan in self.scans if scan >= reference.scan]
         pairs = self.matcher.pairs_at(reference.point, scans, _KERNEL)
-        against = ComparedEstimate(reference.point, reference.covariance, estimate.model)
+        against = reference.compared(estimate.model)
 
         def value(*without: int) -> float:
-            return self._value(
-                self.matcher.linearized(pairs, reference.point, {*without, *self._moving}), against
-            )
+            scores = self.matcher.linearized(pairs, reference.point, {*without, *self._moving})
+            return self.statistic.normalized(self.statistic.compare(scores, against))
 
         # The statistic of a step grows with every frame; that of lasting errors of labels does not.
         more = len(scans) / (FRAMES + CONFIRMATIONS)
@@ -353,6 +350,3 @@ class ChangeDetector:
         least = max(threshold, _LEAST_SHARE_OF_OTHERS * whole)
         objects = self.matcher.objects_of(scans) - self._moving
         return whole > least and all(value(track) > least for track in objects)
-
-    def _value(self, scores: Collection[LinearizedPair], estimate: ComparedEstimate) -> float:
-        return self.statistic.normalized(self.statistic.compare(scores, estimate.covariance, estimate.model))

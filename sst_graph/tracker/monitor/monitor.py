@@ -8,7 +8,7 @@ from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.estimate import FrameMatches, OnlineEstimate
 from sst_graph.tracker.monitor.adoption import Adoption
 from sst_graph.tracker.monitor.change_detector import ChangeDetector
-from sst_graph.tracker.start.first_estimate import Guess
+from sst_graph.tracker.start.first_estimate import StartGuess
 from sst_graph.tracker.start.initializer import Restart
 from sst_graph.tracker.window.matcher import WindowMatcher
 
@@ -44,13 +44,12 @@ class Monitor:
         """
         counts = {scan: len(matches.found[scan].pair) for scan in matches.new}
         chi2 = self.changes.check(sorted(matches.waiting), counts, estimate.for_comparison())
-        change = self.changes.change(estimate.for_comparison())
+        change = self.changes.change(estimate.for_comparison(), chi2)
         if change is not None:
             if self.changes.start_is_over(matches.scan):
-                near = Guess(change.near.cTl, change.near.time_offset_s, search=change.far)
-                return chi2, Restart(near, change.scans, "the calibration has changed", True, chi2)
+                return chi2, change
             self.changes.refused_starts += 1
-            near = Guess(estimate.point.cTl, estimate.point.time_offset_s)
+            near = StartGuess(estimate.point.cTl, estimate.point.time_offset_s)
             why = "new frames contradict the start: it is estimated again"
             return chi2, Restart(near, change.scans, why)
         if matches.new:

@@ -97,17 +97,6 @@ class Comparison:
     noise: FloatArray
     prior: FloatArray
 
-    @classmethod
-    def of(
-        cls,
-        scores: Collection[LinearizedPair],
-        covariance: EstimateCovariance,
-        model: ErrorModel,
-        object_sigma_px: float,
-    ) -> Comparison:
-        """object_sigma_px: standard deviation of a new object's mask bias from its class's [px]."""
-        return ComparedScores.of(scores, covariance, model, object_sigma_px).part(0, len(scores))
-
     def chi2(self) -> float:
         """T of the frames."""
         return _squared(self.gradient, self.noise + self.jacobian @ self.prior @ self.jacobian.T)
@@ -139,13 +128,10 @@ class ComparedScores:
 
     @classmethod
     def of(
-        cls,
-        scores: Collection[LinearizedPair],
-        covariance: EstimateCovariance,
-        model: ErrorModel,
-        object_sigma_px: float,
+        cls, scores: Collection[LinearizedPair], estimate: ComparedEstimate, object_sigma_px: float
     ) -> ComparedScores:
-        """The arguments are those of :meth:`Comparison.of`."""
+        """object_sigma_px: standard deviation of a new object's mask bias from its class's [px]."""
+        covariance, model = estimate.covariance, estimate.model
         n = covariance.core_size
         places = {track: place for score in scores for track, place in score.places.items()}
         column = {track: n + k for k, track in enumerate(places)}
@@ -196,16 +182,14 @@ class ChangeStatistic:
         self.latest = None
         self.exceeded = 0
 
-    def add(
-        self, scores: Sequence[LinearizedPair], covariance: EstimateCovariance, model: ErrorModel
-    ) -> float | None:
+    def add(self, scores: Sequence[LinearizedPair], estimate: ComparedEstimate) -> float | None:
         """The statistic with new frames' scores; None while there are too few."""
         self.recent.extend(scores)
         if not scores or len(self.recent) < FRAMES:
             return None
-        self.latest = self.compare(self.recent, covariance, model)
+        self.latest = self.compare(self.recent, estimate)
         T = self.latest.chi2()
-        value = T / self._scale(covariance.core_size)
+        value = T / self._scale(estimate.covariance.core_size)
         if value > self.threshold:
             self.exceeded += 1
         else:
@@ -213,21 +197,18 @@ class ChangeStatistic:
             self.usual.append(T)
         return value
 
-    def compare(
-        self, scores: Collection[LinearizedPair], covariance: EstimateCovariance, model: ErrorModel
-    ) -> Comparison:
+    def compare(self, scores: Collection[LinearizedPair], estimate: ComparedEstimate) -> Comparison:
         """Scores of any frames against an estimate."""
-        return Comparison.of(scores, covariance, model, self.object_sigma_px)
+        return ComparedScores.of(scores, estimate, self.object_sigma_px).part(0, len(scores))
 
     def largest_of_parts(
         self,
         scores: Sequence[LinearizedPair],
         parts: Collection[tuple[int, int]],
-        covariance: EstimateCovariance,
-        model: ErrorModel,
+        estimate: ComparedEstimate,
     ) -> float:
         """Largest :meth:`normalized` statistic of parts (start, end) of the scores; 0 without any."""
-        compared = ComparedScores.of(scores, covariance, model, self.object_sigma_px)
+        compared = ComparedScores.of(scores, estimate, self.object_sigma_px)
         return max((self.normalized(compared.part(a, b)) for a, b in parts if b > a), default=0.0)
 
     def normalized(self, comparison: Comparison) -> float:

@@ -13,21 +13,17 @@ from sst_graph.objects.dynamic_objects import DynamicObject
 from sst_graph.objects.tracks import ObjectId
 from sst_graph.tracker.by_edges.review import EdgeReview
 from sst_graph.tracker.window.gaussian import Point
-from sst_graph.types import SemanticClass
+from sst_graph.types import Guess, SemanticClass
 
 
 @dataclass(frozen=True)
-class Guess:
+class StartGuess(Guess):
     """Where a start begins.
 
     Attributes:
-        cTl: rough extrinsic, or None where nothing is known.
-        time_offset_s: rough time offset [s].
         search: search around the guess; False trusts it to within a degree or two.
     """
 
-    cTl: gtsam.Pose3 | None
-    time_offset_s: float
     search: bool = True
 
     def point(self, classes: tuple[SemanticClass, ...], names: Sequence[str] = ()) -> Point:

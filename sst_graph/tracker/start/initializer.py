@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from sst_graph.batch.lower_edges import LowerEdgeSupport
+from sst_graph.errors import EstimationError
 from sst_graph.stepwise import Stepwise
-from sst_graph.tracker.by_edges.kinds import by_edges
+from sst_graph.tracker.by_edges.kinds import by_edges, by_labels, of_kind
 from sst_graph.tracker.by_edges.review import softness
+from sst_graph.tracker.by_edges.start import first_edge_estimate_steps
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.spread_work import NUMERICAL_ERRORS, SpreadWork
-from sst_graph.tracker.start.first_estimate import FirstEstimate, Guess, Stretch
-from sst_graph.tracker.start.solution import prior_gaussian
-from sst_graph.tracker.start.steps import start_steps
+from sst_graph.tracker.start.first_estimate import FirstEstimate, StartGuess, Stretch
+from sst_graph.tracker.start.solution import first_estimate_steps, prior_gaussian
 from sst_graph.tracker.uncertainty import Uncertainty
 from sst_graph.tracker.window.epochs import MatchedPair
 from sst_graph.tracker.window.matcher import WindowMatcher
@@ -59,7 +59,7 @@ class Restart:
         chi2: statistic that shows it, if any.
     """
 
-    guess: Guess
+    guess: StartGuess
     scans: int
     reason: str
     alarm: bool = False
@@ -82,6 +82,28 @@ class Initialization:
         return softness(self.first.review, self.uncertainty.covariance)
 
 
+def start_steps(stretch: Stretch, guess: StartGuess, config: TrackerConfig) -> Stepwise[FirstEstimate]:
+    """The batch solution of some scans, step by step: by labels where there are any, by edges otherwise.
+
+    Raises:
+        EstimationError: none.
+    """
+    classes, drive, why = config.calibration.classes, stretch.drive, ""
+    if not by_edges(classes):
+        return FirstEstimate((yield from first_estimate_steps(drive, guess, config)))
+    if by_labels(classes) and all(drive.labelled_ns):
+        labelled = of_kind(drive, edges=False)
+        try:
+            return FirstEstimate((yield from first_estimate_steps(labelled, guess, config)))
+        except EstimationError as error:
+            why = f"by labels: {error}; by edges: "
+    try:
+        unlabelled = replace(stretch, drive=of_kind(drive, edges=True))
+        return (yield from first_edge_estimate_steps(unlabelled, guess, config))
+    except EstimationError as error:
+        raise EstimationError(f"{why}{error}") from error
+
+
 class Search(SpreadWork[FirstEstimate]):
     """A batch solution of some scans that is being computed.
 
@@ -91,7 +113,9 @@ class Search(SpreadWork[FirstEstimate]):
         guess: where it begins.
     """
 
-    def __init__(self, stretch: Stretch, numbers: Sequence[int], guess: Guess, config: TrackerConfig) -> None:
+    def __init__(
+        self, stretch: Stretch, numbers: Sequence[int], guess: StartGuess, config: TrackerConfig
+    ) -> None:
         super().__init__()
         self.stretch, self.numbers, self.guess, self.config = stretch, tuple(numbers), guess, config
 
@@ -147,7 +171,7 @@ class Initializer:
         work_per_frame: done with each frame; None: all with one, which takes seconds.
     """
 
-    def __init__(self, guess: Guess, config: TrackerConfig) -> None:
+    def __init__(self, guess: StartGuess, config: TrackerConfig) -> None:
         self.guess, self.config = guess, config
         self.waited = self.attempts = 0
         self.alarmed = False
@@ -156,7 +180,7 @@ class Initializer:
         self.why = ""
         self.work_per_frame: int | None = _WORK_PER_FRAME
 
-    def restart(self, guess: Guess, scans: int, alarmed: bool) -> None:
+    def restart(self, guess: StartGuess, scans: int, alarmed: bool) -> None:
         """From a guess, with some scans that are there already."""
         self.guess, self.waited, self.search, self.graph = guess, scans, None, None
         self.alarmed = self.alarmed or alarmed
@@ -261,18 +285,12 @@ class Initializer:
         smoother.update(found, set(), window.first_scan, window.objects.live)
         return Initialization(smoother, Uncertainty.of(smoother), len(initial.chosen), initial.first)
 
-    def catch_up(self) -> None:
-        """Repeat the work that a stored search had done."""
-        if self.search is not None:
-            with suppress(*NUMERICAL_ERRORS):
-                self.search.advance(0)
-
     def failed(self, why: str) -> None:
         """An attempt has failed; after some, all of the surroundings of the guess are searched."""
         self.attempts, self.why = self.attempts + 1, why
         self.search = self.graph = None
         if self.attempts >= _MAX_ATTEMPTS:
-            self.guess = Guess(self.guess.cTl, self.guess.time_offset_s)
+            self.guess = StartGuess(self.guess.cTl, self.guess.time_offset_s)
 
     def succeeded(self) -> None:
         """There is an estimate."""

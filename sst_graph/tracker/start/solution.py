@@ -6,21 +6,19 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 
 from sst_graph.association.time_pairing import pair_by_time
 from sst_graph.assumptions import named_sigmas
-from sst_graph.drive.preparation import Drive
+from sst_graph.drive.preparation import Drive, boundary_count
 from sst_graph.errors import EstimationError
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.building import (
     LOWER_EDGE_BIAS_SIGMA_PX,
     PRIOR_ROTATION_SIGMA_RAD,
     PRIOR_TRANSLATION_SIGMA_M,
-    GraphConfig,
-    Tracks,
 )
+from sst_graph.graph.matching import GraphConfig, Tracks, associate
 from sst_graph.graph.outer_loop import (
     KERNELS_PX,
     MIN_EXPLAINED,
@@ -32,12 +30,12 @@ from sst_graph.graph.outer_loop import (
 )
 from sst_graph.graph.state import State
 from sst_graph.initialization.candidates import StartProblem
-from sst_graph.initialization.selection import select_start_steps
+from sst_graph.initialization.selection import select_start_steps, turn_rad
 from sst_graph.stepwise import Stepwise
 from sst_graph.tracker.config import TrackerConfig
-from sst_graph.tracker.monitor.adoption import held_out_cost
-from sst_graph.tracker.start.first_estimate import FirstEstimate, Guess
+from sst_graph.tracker.start.first_estimate import FirstEstimate, StartGuess
 from sst_graph.tracker.window.gaussian import Gaussian, Point
+from sst_graph.tracker.window.matcher import mean_cost
 from sst_graph.types import SemanticClass
 
 _OTHER_BASIN_RAD = float(np.radians(2.0))
@@ -63,7 +61,7 @@ class _Solved:
 
     def in_other_basin_than(self, other: _Solved) -> bool:
         """Whether the two are in different basins of convergence."""
-        return _turn_rad(self.point.cTl, other.point.cTl) > _OTHER_BASIN_RAD
+        return turn_rad(self.point.cTl, other.point.cTl) > _OTHER_BASIN_RAD
 
 
 @dataclass(frozen=True)
@@ -91,7 +89,7 @@ class _NotConverged(EstimationError):
         self.reached = reached
 
 
-def first_estimate_steps(drive: Drive, guess: Guess, config: TrackerConfig) -> Stepwise[Point]:
+def first_estimate_steps(drive: Drive, guess: StartGuess, config: TrackerConfig) -> Stepwise[Point]:
     """The batch solution of some scans of the window, step by step.
 
     A short stretch of driving at one speed does not determine the time offset. So the offset stays near the
@@ -129,13 +127,9 @@ def _one_of_each_basin(starts: Sequence[State]) -> list[State]:
     """One start of each basin of convergence: those in the basin of an earlier one are left out."""
     chosen: list[State] = []
     for start in starts:
-        if all(_turn_rad(start.cTl, other.cTl) > _OTHER_BASIN_RAD for other in chosen):
+        if all(turn_rad(start.cTl, other.cTl) > _OTHER_BASIN_RAD for other in chosen):
             chosen.append(start)
     return chosen
-
-
-def _turn_rad(one: gtsam.Pose3, other: gtsam.Pose3) -> float:
-    return float(np.linalg.norm(gtsam.Rot3.Logmap(one.between(other).rotation())))
 
 
 def _all_of(attempts: Sequence[Stepwise[_Solved]]) -> Stepwise[tuple[list[_Solved], list[EstimationError]]]:
@@ -189,7 +183,7 @@ def _best(problem: _Problem, starts: Sequence[State], kernels_px: Sequence[float
 
 
 def _starts(
-    drive: Drive, tracks: Tracks, guess: Guess, config: TrackerConfig, reach_s: float
+    drive: Drive, tracks: Tracks, guess: StartGuess, config: TrackerConfig, reach_s: float
 ) -> Stepwise[list[State]]:
     """Where the solutions begin: the candidates that the batch's selection keeps, with offsets within
     ``reach_s`` of the guess's, or the guess itself.
@@ -201,7 +195,7 @@ def _starts(
     enabled = guess.search or guess.cTl is None
     search = dataclasses.replace(calibration.search, time_offset_s=reach_s, enabled=enabled)
     joint = _damped(config) if reach_s == 0.0 else calibration.joint
-    problem = StartProblem([drive], tracks, calibration.classes, guess.cTl, guess.time_offset_s)
+    problem = StartProblem([drive], tracks, calibration.classes, guess)
     selection = yield from select_start_steps(problem, joint.graph, search)
     return [State(cTl, (time_offset_s,)) for cTl, time_offset_s in selection.starts]
 
@@ -220,11 +214,8 @@ def _solution(problem: _Problem, start: State, kernels_px: Sequence[float]) -> S
     solution = yield from solve_joint_steps(problem.joint, start, kernels_px)
     yield _COST_WORK
     state = solution.state
-    biases = [state.biases_px.get((0, c), 0.0) for c in calibration.classes]
-    names = tuple(name for name, _ in named_sigmas(calibration.noise.estimate))
-    parameters = np.array([state.nuisances.get(name, 0.0) for name in names])
-    cTl, time_offset_s = state.cTl, state.time_offset_s(0)
-    point = Point(cTl, time_offset_s, np.array(2 * biases), names=names, parameters=parameters)
+    names = [name for name, _ in named_sigmas(calibration.noise.estimate)]
+    point = Point.of_state(state, calibration.classes, names)
     if not solution.converged:
         message = f"the first solution still moved after {solution.outer_iterations} iterations"
         raise _NotConverged(message, _Solved(_cost(problem, point), point))
@@ -237,9 +228,12 @@ def _solution(problem: _Problem, start: State, kernels_px: Sequence[float]) -> S
 
 def _cost(problem: _Problem, point: Point) -> float:
     """Mean cost of all boundary points of the window."""
-    joint, classes = problem.config.calibration.joint, problem.config.calibration.classes
+    graph, classes = problem.config.calibration.noise, problem.config.calibration.classes
     kernel = RobustKernel("geman_mcclure", KERNELS_PX[-1])
-    cost = held_out_cost(problem.drive, problem.tracks, point, classes, kernel, joint.graph)
+    pairs = associate([problem.drive], problem.tracks, point.state(classes), kernel, graph)
+    scans, below = problem.drive.scans, graph.lower_edges
+    counted = [(pair, boundary_count(scans[pair.pair.scan], below)) for pair in pairs]
+    cost = mean_cost(counted, point, classes, kernel)
     if cost is None:
         raise EstimationError("no boundary point meets an image")
     return cost
@@ -262,7 +256,7 @@ def _check_pairs(
 
 
 def prior_gaussian(
-    first: FirstEstimate, guess: Guess, classes: tuple[SemanticClass, ...], config: GraphConfig
+    first: FirstEstimate, guess: StartGuess, classes: tuple[SemanticClass, ...], config: GraphConfig
 ) -> Gaussian:
     """The batch's own weak priors around the guess, and what else is known, linearized at a first estimate.
 

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from sst_graph.tracker.tracker import Tracker
 
 FORMAT = "sst-graph/tracker"
-VERSION = 25
+VERSION = 26
 """Goes up whenever what a tracker holds changes: a checkpoint is for the version that wrote it."""
 
 CHECKPOINT = FileKind("a checkpoint of the tracker", 512 * 1024 * 1024)
@@ -81,7 +81,6 @@ _PACKAGES = (
     "sst_graph.objects",
     "sst_graph.odometry",
     "sst_graph.result",
-    "sst_graph.odometry.sweep",
     "sst_graph.sweep_timing",
     "sst_graph.tracker",
     "sst_graph.types",
@@ -263,8 +262,7 @@ def load_checkpoint(
         warnings.simplefilter("ignore")
         _check_tracker(_tracker(document, data, path), path)
         tracker = _tracker(document, data, path)
-        tracker.initializer.catch_up()
-        tracker.estimate.catch_up()
+        _catch_up(tracker)
     if setup is not None:
         check_setup(tracker, setup, path)
     if sweep is not None:
@@ -333,7 +331,7 @@ def _check_tracker(tracker: Tracker, path: str | Path) -> None:
     try:
         checked_camera(tracker.inputs.camera, "camera")
         check_inputs(tracker)
-        tracker.initializer.catch_up()
+        _catch_up(tracker)
         current_update(tracker, tracker.last_update).to_dict()
         consolidate(tracker)
         _again(tracker)
@@ -342,6 +340,14 @@ def _check_tracker(tracker: Tracker, path: str | Path) -> None:
     except Exception as error:
         found = f"a tracker that gives no estimate ({type(error).__name__}: {error})"
         raise CheckpointError(path, found, "all of a tracker") from error
+
+
+def _catch_up(tracker: Tracker) -> None:
+    """Repeat the work that a stored search, or a stored review, had done."""
+    edges = tracker.estimate.edges
+    for under_way in (tracker.initializer.search, None if edges is None else edges.review):
+        if under_way is not None:
+            under_way.catch_up()
 
 
 def _again(tracker: Tracker) -> None:

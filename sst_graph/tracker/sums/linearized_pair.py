@@ -16,7 +16,8 @@ from sst_graph.covariance.sums import ScoreSums
 from sst_graph.drive.trajectory import camera_twist
 from sst_graph.factors.alignment import weighted_residuals
 from sst_graph.factors.motion import twist_ad
-from sst_graph.graph.building import UNKNOWN_TWIST_SIGMAS, PairMatches
+from sst_graph.graph.building import UNKNOWN_TWIST_SIGMAS
+from sst_graph.graph.matching import PairMatches
 from sst_graph.graph.nuisances import columns_of_jacobian
 from sst_graph.graph.state import lower_edge_track
 from sst_graph.objects.tracks import numbers_in, of_each

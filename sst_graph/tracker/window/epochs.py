@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sst_graph.covariance.error_model import ErrorModel
 from sst_graph.covariance.jackknife import composed
-from sst_graph.graph.building import PairMatches
+from sst_graph.graph.matching import PairMatches
 from sst_graph.tracker.sums.linearized_pair import LinearizedPair
 from sst_graph.tracker.sums.running_sums import RunningSums
 from sst_graph.tracker.window.gaussian import Gaussian, Point

@@ -55,6 +55,14 @@ class Point:
         nothing = np.zeros(len(names))
         return cls(cTl, time_offset_s, np.zeros(2 * len(classes)), names=tuple(names), parameters=nothing)
 
+    @classmethod
+    def of_state(cls, state: State, classes: Sequence[SemanticClass], names: Sequence[str]) -> Point:
+        """A state of one drive, lower edges with the biases of their classes; names: of its parameters."""
+        biases = [state.biases_px.get((0, c), 0.0) for c in classes]
+        parameters = np.array([state.nuisances.get(name, 0.0) for name in names])
+        offset_s = state.time_offset_s(0)
+        return cls(state.cTl, offset_s, np.array(2 * biases), names=tuple(names), parameters=parameters)
+
     @property
     def size(self) -> int:
         return self.core_size + len(self.tracks)

@@ -8,17 +8,23 @@ from typing import Any
 
 import numpy as np
 
+from sst_graph.association.edge_matching import GATE
 from sst_graph.association.time_pairing import pair_by_time
 from sst_graph.batch.lower_edges import LowerEdgeSupport, lower_edge_support
 from sst_graph.drive.preparation import Drive, boundaries_of, boundary_count
 from sst_graph.drive.trajectory import GrowingTrack
+from sst_graph.factors import alignment_cost
 from sst_graph.factors.robust import RobustKernel
-from sst_graph.graph.building import GraphConfig, PairMatches, Tracks, associate
-from sst_graph.graph.matching import DYNAMIC_REACH_M, DriveEdges, edges_of
+from sst_graph.graph.matching import (
+    DYNAMIC_REACH_M,
+    GraphConfig,
+    PairMatches,
+    Tracks,
+    associate,
+)
 from sst_graph.graph.outer_loop import KERNELS_PX
 from sst_graph.tracker.by_edges.kinds import EDGE_KERNEL_SHARE, by_edges, by_labels, of_kind
 from sst_graph.tracker.config import TrackerConfig
-from sst_graph.tracker.monitor.adoption import mean_cost
 from sst_graph.tracker.sums.held import held_names
 from sst_graph.tracker.sums.linearized_pair import LinearizedPair, PairColumns, linearize_pair, with_share
 from sst_graph.tracker.window.epochs import MatchedPair
@@ -207,11 +213,6 @@ class WindowMatcher:
         narrow = replace(kernel, scale=EDGE_KERNEL_SHARE * kernel.scale)
         yield of_kind(part, edges=True), narrow, replace(self.graph, edge_place="peak")
 
-    def edges_of(self, chosen: Collection[int]) -> list[DriveEdges]:
-        """The boundary points of objects without a class of some scans."""
-        part, numbers = self.window.drive(chosen.__contains__)
-        return edges_of([of_kind(part, edges=True)], self._tracks(part, numbers), self.graph)
-
     def _linearized(
         self,
         pair: PairMatches,
@@ -234,3 +235,26 @@ class WindowMatcher:
             if self.graph.object_bias_sigma_px > 0.0
             else twists
         )
+
+
+def mean_cost(
+    pairs: Sequence[tuple[PairMatches, int]],
+    point: Point,
+    classes: tuple[SemanticClass, ...],
+    kernel: RobustKernel,
+) -> float | None:
+    """Mean robust cost of boundary points, given each pair's matches and number of boundary points.
+
+    A point that finds no contour costs as much as the farthest match. None where none is in view.
+    """
+    cost, count = 0.0, 0
+    for pair, total in pairs:
+        own = next((matches.alignment.kernel for matches in pair.matches.values()), kernel)
+        count += total
+        cost += float(own.loss(GATE * own.scale)) * (total - len(pair))
+        for c, matches in pair.matches.items():
+            bias = float(point.biases_px[classes.index(c)])
+            cost += alignment_cost(
+                matches.alignment, point.cTl, point.time_offset_s, pair.motion.c_twist, bias
+            )
+    return cost / count if count else None

@@ -18,8 +18,9 @@ from sst_graph.covariance.error_model import ErrorModel
 from sst_graph.covariance.jackknife import composed
 from sst_graph.errors import EstimationError
 from sst_graph.factors import extrinsic_drift, time_offset_drift
-from sst_graph.graph.building import GraphConfig, motion_factor, silhouettes_factor
+from sst_graph.graph.building import motion_factor, silhouettes_factor
 from sst_graph.graph.linear import scaled_inverse
+from sst_graph.graph.matching import GraphConfig
 from sst_graph.graph.state import (
     bias_key,
     lower_edge_track,

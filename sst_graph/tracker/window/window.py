@@ -10,6 +10,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.batch.by_edges.parts import thinned_scan
+from sst_graph.batch.by_edges.problem import POINTS_A_SCAN
 from sst_graph.drive.preparation import Drive, ImageFeatures, ScanFeatures
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
@@ -17,7 +19,7 @@ from sst_graph.objects.dynamic_objects import DynamicObject, DynamicObjectTest, 
 from sst_graph.objects.occupancy import ObjectName
 from sst_graph.objects.tracks import ObjectId, ObjectTracker
 from sst_graph.odometry.visual import ImagePair
-from sst_graph.tracker.by_edges.kinds import both_kinds, by_edges, by_labels, thinned_edges
+from sst_graph.tracker.by_edges.kinds import both_kinds, by_edges, by_labels
 from sst_graph.types import RelativeMotion, SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -120,7 +122,9 @@ class Window:
         lean = dataclasses.replace(
             features, depth_lPs=features.depth_lPs[:0], depth_offsets_s=features.depth_offsets_s[:0]
         )
-        self.scans.append((number, thinned_edges(lean) if self.edges else lean))
+        # Edges keep no more points than are matched.
+        few = thinned_scan(lean, POINTS_A_SCAN, (SemanticClass.OBJECT,)) if self.edges else lean
+        self.scans.append((number, few))
         self._thin_out()
         self.tracks[number] = self.objects.add(features.boundaries, self.wTl)
         self.dynamics.add(number, lean, self.tracks[number], self.wTl, self.first_scan)

@@ -18,7 +18,7 @@ from sst_graph.batch.by_edges.choice import with_method_for, with_method_of
 from sst_graph.batch.by_edges.fusion import Fused
 from sst_graph.batch.by_edges.label_parts import split_by_labels
 from sst_graph.batch.calibrate import prepare_drives
-from sst_graph.batch.method_estimate import Guess, MethodEstimate
+from sst_graph.batch.method_estimate import MethodEstimate
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import Drive
@@ -29,7 +29,7 @@ from sst_graph.graph.outer_loop import JointSolution, solve_joint
 from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
 from sst_graph.metrics import calibration_errors
 from sst_graph.simulator import SimulationConfig
-from sst_graph.types import Frame, SemanticClass
+from sst_graph.types import Frame, Guess, SemanticClass
 
 FloatArray = NDArray[np.float64]
 VEHICLE, OBJECT, IGNORE = SemanticClass.VEHICLE, SemanticClass.OBJECT, SemanticClass.IGNORE

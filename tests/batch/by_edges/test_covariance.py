@@ -22,7 +22,6 @@ from sst_graph.batch.by_edges.parts import thinned, with_objects, without_kind
 from sst_graph.batch.by_edges.positions import position_columns
 from sst_graph.batch.by_edges.reasons import MAX_WIDER_KERNEL_STEP, wider_kernel_reasons
 from sst_graph.batch.calibrate import prepare_drives
-from sst_graph.batch.method_estimate import Guess
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.covariance.shared_errors import FEWEST, spread_covariance
 from sst_graph.drive.preparation import Drive
@@ -31,7 +30,7 @@ from sst_graph.graph.outer_loop import solve_joint
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.simulator import SimulationConfig
-from sst_graph.types import SemanticClass
+from sst_graph.types import Guess, SemanticClass
 from studies.edges_poor_scenes import SCENES, START, drive_through
 
 STREET = SimulationConfig(seed=504, frames=3, motion="no_stop", azimuth_limit_deg=50.0, width=621, height=188)

@@ -14,12 +14,12 @@ from sst_graph import CalibrationConfig
 from sst_graph.batch.by_edges.halves import halves_reasons
 from sst_graph.batch.by_edges.parts import thinned
 from sst_graph.batch.calibrate import prepare_drives
-from sst_graph.batch.method_estimate import Guess
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.graph.outer_loop import JointProblem
 from sst_graph.graph.state import State
 from sst_graph.simulator import SimulationConfig
+from sst_graph.types import Guess
 from studies.subtle_faults import knocked
 
 STREET = SimulationConfig(

@@ -17,7 +17,6 @@ from sst_graph.batch.by_edges.optimum import START_KERNELS_PX
 from sst_graph.batch.by_edges.parts import thinned
 from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX
 from sst_graph.batch.calibrate import prepare_drives
-from sst_graph.batch.method_estimate import Guess
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.drive.preparation import Drive
@@ -25,6 +24,7 @@ from sst_graph.graph.outer_loop import solve_joint
 from sst_graph.graph.state import State
 from sst_graph.simulator import SimulationConfig
 from sst_graph.stepwise import run_to_end
+from sst_graph.types import Guess
 
 STREET = SimulationConfig(
     seed=504,
