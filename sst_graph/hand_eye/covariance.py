@@ -5,7 +5,7 @@ A scan and an image end one pair and begin the next, so scores of neighbours are
 summed with falling weights (Bartlett's kernel: Newey & West, Econometrica 1987), with the usual correction
 for few pairs (Cameron & Miller, A practitioner's guide to cluster-robust inference, 2015, sec. VI.B).
 An error that all pairs share, such as that of the principal point, does not show in the residuals: it is
-given by :class:`SharedErrors`.
+given by :class:`MotionErrors`.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ smoothing spreads errors a little farther. More lags make the estimate noisier."
 
 
 @dataclass(frozen=True)
-class SharedErrors:
+class MotionErrors:
     """Sigmas of the errors that all pairs share.
 
     Attributes:
@@ -51,12 +51,12 @@ class SharedErrors:
     turn_rate_deg_s: float = 0.02
 
 
-SHARED_ERRORS = SharedErrors()
+MOTION_ERRORS = MotionErrors()
 """Of the odometry here."""
 
 
 def hand_eye_covariance(
-    terms: HandEyeTerms, state: State, hessian: FloatArray, errors: SharedErrors = SHARED_ERRORS
+    terms: HandEyeTerms, state: State, hessian: FloatArray, errors: MotionErrors = MOTION_ERRORS
 ) -> FloatArray:
     """(7, 7) covariance of [extrinsic 6, offset]: sandwich over neighbours, at most the priors' own.
 

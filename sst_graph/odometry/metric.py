@@ -38,7 +38,7 @@ _FAILED_RAD, _FAILED_M = 0.1, 3.0
 
 
 @dataclass(frozen=True)
-class SharedErrors:
+class TrackErrors:
     """Errors that all tracks of a motion have in common, which no residual shows.
 
     Attributes:
@@ -51,7 +51,7 @@ class SharedErrors:
     floor_m: float = 2e-3
 
 
-_SHARED = SharedErrors()
+_TRACK_ERRORS = TrackErrors()
 
 
 def metric_motion(
@@ -80,7 +80,7 @@ def motion_from_depths(
     direction_motion: DirectionMotion,
     depths: InverseDepths,
     camera: PinholeCamera,
-    shared: SharedErrors = _SHARED,
+    shared: TrackErrors = _TRACK_ERRORS,
 ) -> RelativeMotion:
     """:func:`metric_motion` with the inverse depth of each track already known."""
     if np.count_nonzero(depths.known) < _MIN_DEPTHS:

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from sst_graph.graph.state import State
-from sst_graph.hand_eye.covariance import MOST_TAKEN_OFF, SharedErrors, hand_eye_covariance
+from sst_graph.hand_eye.covariance import MOST_TAKEN_OFF, MotionErrors, hand_eye_covariance
 from sst_graph.hand_eye.graph import HandEyeTerms, MotionPairs
 
 PAIRS = 600
-NOTHING_SHARED = SharedErrors(direction_deg=0.0, turn_rate_deg_s=0.0)
+NOTHING_SHARED = MotionErrors(direction_deg=0.0, turn_rate_deg_s=0.0)
 
 
 def _covariance(noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

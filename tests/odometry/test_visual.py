@@ -14,7 +14,7 @@ from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.odometry.depth import InverseDepths, inverse_depths
 from sst_graph.odometry.features import FeatureTracker, Tracks, detect_corners
-from sst_graph.odometry.metric import SharedErrors, metric_motion, motion_from_depths
+from sst_graph.odometry.metric import TrackErrors, metric_motion, motion_from_depths
 from sst_graph.odometry.relative import rays, relative_pose
 from sst_graph.odometry.starts import consensus_translation
 from sst_graph.odometry.visual import VisualOdometry, image_pairs, metric_motions, visual_odometry
@@ -23,7 +23,7 @@ from sst_graph.types import CameraImage, SemanticClass
 FloatArray = NDArray[np.float64]
 
 CAMERA = PinholeCamera(721.5, 721.5, 609.6, 172.9, 1242, 375)
-PURE = SharedErrors(0.0, 0.0, 0.0)
+PURE = TrackErrors(0.0, 0.0, 0.0)
 """Only what pixels and depths bring: the floors stand for what simulated tracks don't have."""
 
 
@@ -155,7 +155,7 @@ def test_scale_sigma_acts_along_the_motion() -> None:
     tracks, depths = made_tracks(np.random.default_rng(2), motion_of([0, 0, 0], [0, 0, 1.0]))
     direction = relative_pose(tracks, CAMERA)
     pure = motion_from_depths(tracks, direction, depths, CAMERA, PURE)
-    shared = motion_from_depths(tracks, direction, depths, CAMERA, SharedErrors(0.05, 0.0, 0.0))
+    shared = motion_from_depths(tracks, direction, depths, CAMERA, TrackErrors(0.05, 0.0, 0.0))
     extra = shared.covariance - pure.covariance
     assert np.sqrt(extra[5, 5]) == pytest.approx(0.05, rel=0.02)
     assert abs(extra[3, 3]) < 1e-5
