@@ -23,7 +23,7 @@ from sst_graph.fleet.record import Record
 
 LOCAL = "local"
 """In the place of an address: a cluster on this machine, started for the batch."""
-_PATIENCE_S, _CONNECT_S = 0.5, 20.0
+_PATIENCE_S, _FETCH_S, _CONNECT_S = 0.5, 2.0, 20.0
 _WITHOUT_WORKERS_S = 10.0
 """A local cluster without any worker for this long gets new ones: a nanny gives up a worker that is killed
 while it starts."""
@@ -93,6 +93,8 @@ def run_on_dask(
                     "the same command goes on from here, on this one or another"
                 ) from None
             for future, found in outcomes.items():
+                if found is None:
+                    continue
                 job = running.pop(future)
                 is_lost = isinstance(found, distributed.KilledWorker)
                 if is_lost and rounds[job.drive.name] + 1 < _MOST_ROUNDS:
@@ -105,18 +107,21 @@ def run_on_dask(
                 future.release()
 
 
-def _outcome(future: Any) -> Record | BaseException:
-    """What a task gave, or its error: a result can still be lost, with the worker that holds it.
+def _outcome(future: Any) -> Record | BaseException | None:
+    """What a task gave, or its error.
+
+    None where there is nothing after all: a result is lost with the worker that holds it, and the scheduler
+    makes it again, if need be on a worker that has yet to be started.
 
     Raises:
         CancelledError: the scheduler is lost.
     """
     try:
-        record = future.result()
+        record = future.result(timeout=_FETCH_S)
     except CancelledError:
         raise
     except Exception as error:
-        return error
+        return error if future.status == "error" or not isinstance(error, TimeoutError) else None
     assert isinstance(record, Record)
     return record
 
