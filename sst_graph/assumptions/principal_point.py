@@ -16,6 +16,8 @@ def _down(view: View) -> Effect:
 
 
 _SOURCE = "spread of repeated target calibrations: 0.2 to 0.5 px"
+_PREVALENCE = 0.1
+"""A judgement: pictures are cropped, and matrices taken from another day or camera, about that often."""
 _REMEDY = "check that the camera matrix belongs to this image size and crop"
 
 CX = Assumption(
@@ -27,7 +29,7 @@ CX = Assumption(
     span=30.0,
     violation="the pictures lie beside the principal point cx",
     remedy=_REMEDY,
-    prevalence=0.1,  # pictures are cropped, and matrices taken from another day or camera, about that often
+    prevalence=_PREVALENCE,
     by_edges=True,
 )
 CY = Assumption(
@@ -39,6 +41,6 @@ CY = Assumption(
     span=30.0,
     violation="the pictures lie beside the principal point cy",
     remedy=_REMEDY,
-    prevalence=0.1,  # pictures are cropped, and matrices taken from another day or camera, about that often
+    prevalence=_PREVALENCE,
     by_edges=True,
 )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -100,11 +99,7 @@ def fit_of(
     Args:
         covariance: (7, 7) of the result.
     """
-    last, guess = solutions[-1], problem.guess
-    clocks = len(last.state.time_offsets_s)
-    start = None
-    if guess.cTl is not None:
-        start = replace(last.state, cTl=guess.cTl, time_offsets_s=(guess.time_offset_s,) * clocks)
+    last = solutions[-1]
     different = {id(solution): solution for solution in solutions}.values()
     iterations = [each for solution in different for each in solution.iterations]
     along: Sequence[Profile] = ()
@@ -112,7 +107,7 @@ def fit_of(
         sigmas, matches = np.sqrt(np.diag(covariance)), sum(map(len, last.matches))
         along = profiles(last.frozen, last.optimum, sigmas, matches)
     drives = FitOfDrives(problem.drives, problem.tracks, problem.objects, problem.config.joint.graph)
-    return drives.fit(last.state, start, iterations, along)
+    return drives.fit(last.state, problem.at_guess(last.state), iterations, along)
 
 
 def _moving(solution: JointSolution) -> Iterator[str]:

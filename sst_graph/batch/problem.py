@@ -72,6 +72,13 @@ class CalibrationProblem:
         """What the weak priors of a solution from or at a state are centred on."""
         return prior_centre(self.guess, state)
 
+    def at_guess(self, state: State) -> State | None:
+        """A state with the guess's extrinsic and time offset; None where no extrinsic was guessed."""
+        if self.guess.cTl is None:
+            return None
+        offsets_s = (self.guess.time_offset_s,) * len(state.time_offsets_s)
+        return replace(state, cTl=self.guess.cTl, time_offsets_s=offsets_s)
+
     def joint(self) -> JointProblem:
         """The graph's part of the problem."""
         return JointProblem(self.drives, self.tracks, self.config.joint)

@@ -7,6 +7,7 @@ calibration but another unit, a damaged digit or a file of something else.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any, TypeGuard
 
 import gtsam
 import numpy as np
@@ -66,6 +67,11 @@ def checked_pose(matrix: FloatArray, place: str) -> gtsam.Pose3:
         found = f"a translation of {np.abs(matrix[:3, 3]).max():.3g} m"
         raise DataError(place, found, f"metres between two sensors, at most {MAX_TRANSLATION_M:g}")
     return gtsam.Pose3(gtsam.Rot3.ClosestTo(R) if off > 1e-12 else gtsam.Rot3(R), matrix[:3, 3])
+
+
+def is_number(value: Any) -> TypeGuard[float]:
+    """Whether a value from a file is a number of a size that standard deviations have."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MAX_SIGMA
 
 
 def check_covariance(place: str, covariance: FloatArray, min_sigma: float = MIN_SIGMA) -> None:

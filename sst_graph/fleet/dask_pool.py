@@ -120,8 +120,10 @@ def _outcome(future: Any) -> Record | BaseException | None:
         record = future.result(timeout=_FETCH_S)
     except CancelledError:
         raise
+    except TimeoutError as error:  # the task's own, or nothing has come
+        return error if future.status == "error" else None
     except Exception as error:
-        return error if future.status == "error" or not isinstance(error, TimeoutError) else None
+        return error
     assert isinstance(record, Record)
     return record
 

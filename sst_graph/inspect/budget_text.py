@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.covariance.considered import BUDGET
 from sst_graph.errors import printable
-from sst_graph.files.checked_values import MAX_SIGMA
+from sst_graph.files.checked_values import is_number
 from sst_graph.result import CalibrationResult
 
 FloatArray = NDArray[np.float64]
@@ -49,7 +49,7 @@ def estimated_lines(result: CalibrationResult) -> list[str]:
     lines = []
     for name, entry in stored.items() if isinstance(stored, dict) else ():
         values = [entry.get(key) for key in ("value", "sigma")] if isinstance(entry, dict) else [None]
-        if name in ASSUMPTIONS and all(_is_number(v) for v in values):
+        if name in ASSUMPTIONS and all(is_number(v) for v in values):
             lines.append(ASSUMPTIONS[name].figure(*values))
     return lines
 
@@ -69,11 +69,7 @@ def _parts(result: CalibrationResult) -> dict[str, FloatArray]:
 
 
 def _is_sigma(value: Any) -> bool:
-    return _is_number(value) and value >= 0.0
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MAX_SIGMA
+    return is_number(value) and value >= 0.0
 
 
 def _label(name: str, result: CalibrationResult) -> str:

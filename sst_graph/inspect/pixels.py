@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.assumptions.model import View
+from sst_graph.files.checked_values import is_number
 from sst_graph.result import CalibrationResult
 
 FloatArray = NDArray[np.float64]
@@ -73,8 +73,6 @@ def _view(result: CalibrationResult, cP: FloatArray) -> View:
 
 
 def _numbers(values: Any, count: int) -> FloatArray | None:
-    """So many finite numbers; None where a file holds anything else."""
-    if not isinstance(values, list) or len(values) != count:
-        return None
-    good = all(isinstance(x, int | float) and math.isfinite(x) and abs(x) < 1e12 for x in values)
+    """So many numbers; None where a file holds anything else."""
+    good = isinstance(values, list) and len(values) == count and all(map(is_number, values))
     return np.array(values, float) if good else None

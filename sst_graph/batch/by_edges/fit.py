@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,11 +29,8 @@ def fit_of_edges(
     Args:
         covariance: (7, 7) of the result.
     """
-    solution, guess = solutions[-1], calibration.guess
+    solution = solutions[-1]
     state, problem = solution.state, solution.problem
-    start = None
-    if guess.cTl is not None:
-        start = replace(state, cTl=guess.cTl, time_offsets_s=(guess.time_offset_s,))
     iterations = [each for one in solutions for each in one.iterations]
     drives = FitOfDrives(problem.drives, problem.tracks, calibration.objects, problem.config.graph)
     profiles: Sequence[Profile] = ()
@@ -42,4 +38,4 @@ def fit_of_edges(
         frozen = solution.frozen.linearized(solution.optimum).covariance()[:7, :7]
         profiles = score_profiles(drives.edges, state, frozen, np.sqrt(np.diag(covariance)))
     others = turned_states(state, calibration.config.seed)[:_TURNED]
-    return drives.fit(state, start, iterations, profiles, others)
+    return drives.fit(state, calibration.at_guess(state), iterations, profiles, others)

@@ -122,7 +122,8 @@ def lens_steps(
     try:
         wide = yield from solution_steps(free, start, START_KERNELS_PX)
         found = yield from _near(free, wide.state)
-        if _support(free, found) < _LOST * _support(free, start):
+        met, expected = _support(free, found, start)
+        if met < _LOST * expected:
             found = yield from _near(free, start)
     except EstimationError:
         return LensTest()
@@ -138,11 +139,11 @@ def _near(problem: JointProblem, start: State) -> Stepwise[State]:
     return (yield from solution_steps(problem, first.state, NEAR_KERNELS_PX)).state
 
 
-def _support(problem: JointProblem, state: State) -> float:
-    """How many edges are met, by their robust weights."""
+def _support(problem: JointProblem, *states: State) -> list[float]:
+    """How many edges are met at each state, by their robust weights."""
     kernel = RobustKernel("geman_mcclure", NEAR_KERNELS_PX[-1])
     edges = edges_of(problem.drives, problem.tracks, problem.config.graph)
-    return sum(support_of(match_all(edges, state, kernel), state).values())
+    return [sum(support_of(match_all(edges, state, kernel), state).values()) for state in states]
 
 
 def _finding(name: str, value: float, steps: FloatArray, threshold: float) -> ParameterTest | None:
