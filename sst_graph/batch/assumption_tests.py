@@ -10,7 +10,7 @@ contradicted most is solved for once more, alone and from where that step leads,
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -109,16 +109,24 @@ class SolvedProblem:
         return solve_joint(replace(self.problem.joint(), config=free, centre=centre), start, kernels_px)
 
 
+FurtherTests = Callable[[CalibrationProblem, State], tuple[ParameterTest, ...]]
+
+
 def examine_assumptions(
-    problem: CalibrationProblem, estimate: JointEstimate
+    problem: CalibrationProblem, estimate: JointEstimate, further: FurtherTests
 ) -> tuple[tuple[ParameterTest, ...], Considered]:
     """Test the assumptions against the data, and consider in the covariance what the data leave open.
+
+    Args:
+        further: tests by other data than the matches, asked where these contradict nothing.
 
     Returns:
         The tests, the most contradicted first, and what the assumptions add to the covariance.
     """
-    config = problem.config.assumptions
+    config, state = problem.config.assumptions, estimate.solution.state
     findings = check_assumptions(SolvedProblem(problem, estimate.solution), config)
+    if config.test and not any(finding.contradicted for finding in findings):
+        findings = combined_tests(findings, further(problem, state), config.threshold)
     considered = estimate.considered(config)
     return findings, with_test_results(considered, findings)
 
@@ -241,6 +249,22 @@ def _solved_alone(
     alike = abs(value - finding.value) < config.threshold * max(sigma, finding.sigma)
     same = alike and abs(value) > config.threshold * sigma
     return replace(finding, value=value, sigma=sigma) if same else finding
+
+
+def combined_tests(
+    tests: Sequence[ParameterTest], others: Sequence[ParameterTest], threshold: float
+) -> tuple[ParameterTest, ...]:
+    """Tests of the same parameters by data that do not share an error, as one for each parameter, weighted by
+    their variances; the most contradicted first."""
+    found = {each.assumption.name: each for each in tests}
+    for other in others:
+        name = other.assumption.name
+        both = [found[name], other] if name in found else [other]
+        weights = np.array([each.sigma**-2.0 for each in both])
+        value = float(weights @ [each.value for each in both] / weights.sum())
+        sigma = float(weights.sum() ** -0.5)
+        found[name] = replace(other, value=value, sigma=sigma, contradicted=abs(value) > threshold * sigma)
+    return tuple(sorted(found.values(), key=lambda each: -each.score))
 
 
 def few_objects_factor(objects: int, threshold: float) -> float:

@@ -15,6 +15,7 @@ from sst_graph.batch.assumption_tests import assumption_report, contradiction_se
 from sst_graph.batch.baselines import baseline_method
 from sst_graph.batch.by_edges.both import both_method
 from sst_graph.batch.by_edges.choice import with_method_for, with_method_of
+from sst_graph.batch.by_edges.lens import lens_beside_labels
 from sst_graph.batch.by_edges.method import edges_method
 from sst_graph.batch.causes import with_causes
 from sst_graph.batch.config import CalibrationConfig, Method, prepared_classes
@@ -188,7 +189,7 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
     labels_alone = JointEstimate.of(solutions[0], problem.objects)
     motion = with_motion(problem, labels_alone, contradictions.stretches)
     # 6. Assumptions: tested against the data, considered in the covariance.
-    tests, considered = examine_assumptions(problem, motion.estimate)
+    tests, considered = examine_assumptions(problem, motion.estimate, lens_beside_labels)
     # 7. Total covariance: with unmeasured motion and undecided sweeps, which no match shows.
     total = total_covariance(problem, motion.estimate, considered)
     # 8. How it fits the labels, point by point.

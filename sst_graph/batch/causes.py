@@ -54,13 +54,13 @@ def _suspected(
 ) -> tuple[Finding, ...]:
     """What explains a result that is missing, may be wrong, or agrees with few of the labels."""
     fit = fit_labels(config)
-    if not result.frames_used or result.status == "not_converged":
+    if not result.frames_used:
         return likely_causes(drives, guess, fit)
     explained, concentration = (float(result.diagnostics[key]) for key in ("explained", "concentration"))
-    if explained * concentration < _AGREED:
-        solved = Fit(result.T_camera_lidar, result.time_offset_s, explained, concentration)
-        return mirror(drives, guess, fit, solved)
-    return ()
+    solved = Fit(result.T_camera_lidar, result.time_offset_s, explained, concentration)
+    if result.status == "not_converged":
+        return likely_causes(drives, guess, fit, solved)
+    return mirror(drives, guess, fit, solved) if explained * concentration < _AGREED else ()
 
 
 def fit_labels(config: CalibrationConfig) -> Fitter:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Protocol, runtime_checkable
 
@@ -63,6 +64,39 @@ def frame_at(source: Source, position: int) -> Frame:
     if scan is not None:
         scan = with_intensities(checked_scan(scan, place, fewest=0), intensities_of(scan))
     return Frame(frame.index, scan, None if image is None else checked_image(image, source.camera, place))
+
+
+@dataclass(frozen=True, eq=False)
+class NumberedFrames:
+    """Scans and images of a source that was read before, read again by the number of their frame.
+
+    Attributes:
+        source: that was read.
+        positions: of its frames, by number.
+    """
+
+    source: Source
+    positions: Mapping[int, int]
+
+    def scan(self, number: int) -> Scan | None:
+        """Checked scan of a frame.
+
+        Raises:
+            DataError: it cannot be used.
+        """
+        scan = scan_at(self.source, self.positions[number])
+        place = f"{self.source.name}, frame {number}"
+        return None if scan is None else checked_scan(scan, place, fewest=0)
+
+    def image(self, number: int) -> CameraImage | None:
+        """Checked image of a frame.
+
+        Raises:
+            DataError: it cannot be used.
+        """
+        image = image_at(self.source, self.positions[number])
+        place = f"{self.source.name}, frame {number}"
+        return None if image is None else checked_image(image, self.source.camera, place)
 
 
 def _place(source: Source, position: int) -> str:

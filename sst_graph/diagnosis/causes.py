@@ -36,12 +36,15 @@ def preflight(
     return tuple(dict.fromkeys(finding for finding in found if finding is not None))
 
 
-def likely_causes(drives: Sequence[Drive], guess: Guess, fit: Fitter) -> tuple[Finding, ...]:
+def likely_causes(
+    drives: Sequence[Drive], guess: Guess, fit: Fitter, result: Fit | None = None
+) -> tuple[Finding, ...]:
     """Why the labels do not agree, for a result that is missing or may be wrong; empty where they do agree.
 
     Args:
         guess: where the calibration started.
         fit: how well labels agree, by the calibration's own search.
+        result: how well they agree in the result, where there is one.
     """
     drive = max(drives, key=lambda one: len(one.scans))
     certain = labels.foreign_masks(labels.shift(drives)) or units.axes(drive, guess.cTl)
@@ -53,7 +56,8 @@ def likely_causes(drives: Sequence[Drive], guess: Guess, fit: Fitter) -> tuple[F
     cause = best_hypothesis(drive, guess, fit, given)
     if cause is None and guess.cTl is not None:
         cause = wrong_start(guess.cTl, fit(drive, Guess(None, guess.time_offset_s)))
-    if cause is None and (given is None or given.quality < LEAST_QUALITY):
+    best = max(0.0 if one is None else one.quality for one in (given, result))
+    if cause is None and best < LEAST_QUALITY:
         cause = _nothing_in_common(given)
     return () if cause is None else (cause,)
 

@@ -5,7 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from sst_graph.data.frame_parts import image_at, image_positions, number_at, scan_at, scan_positions
+from sst_graph.data.frame_parts import (
+    NumberedFrames,
+    image_at,
+    image_positions,
+    number_at,
+    scan_at,
+    scan_positions,
+)
 from sst_graph.drive.input_statistics import InputStatistics, StatisticsCollector
 from sst_graph.drive.preparation import (
     Drive,
@@ -62,6 +69,7 @@ def with_camera(
         left_out=left_out,
         statistics=_statistics(drive, scans, seen),
         origin_ns=None,
+        frames=NumberedFrames(source, {number_at(source, p): p for p in range(len(source))}),
     )
 
 

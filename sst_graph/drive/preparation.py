@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.config import Settings, internal
+from sst_graph.data.frame_parts import NumberedFrames
 from sst_graph.drive.geometric_labels import labelled_by_geometry
 from sst_graph.drive.input_statistics import InputStatistics, StatisticsCollector
 from sst_graph.drive.trajectory import GrowingTrack, TwistTrack
@@ -233,6 +234,7 @@ class Drive:
         origin_ns: stamp of an image from which assumptions about clocks count time; None: the first one's.
         labelled_ns: stamps of the scans and of the images whose labels are aligned. Objects without a class
             are not matched between two of these.
+        frames: where they can be read again; None: tests that need more than is kept are left out.
     """
 
     name: str
@@ -246,6 +248,7 @@ class Drive:
     sweep: SweepDecision | None = None
     origin_ns: int | None = None
     labelled_ns: tuple[frozenset[int], frozenset[int]] = (frozenset(), frozenset())
+    frames: NumberedFrames | None = None
 
     def have_labels(self, scan: int, image: int) -> bool:
         """Whether a scan and an image, by position, both have labels that are aligned."""
@@ -318,10 +321,12 @@ def prepare_drive(
     odometry = LidarOdometry(config.lidar_odometry)
     tracker = FeatureTracker()
     scans, images, motions, pairs = [], [], [], []
+    positions: dict[int, int] = {}
     total = len(source)
     left_out, collector, store = LeftOut(), StatisticsCollector(total), ArrayStore(config.in_memory_bytes)
     for position, frame in enumerate(source):
         frame = _checked(frame, source.camera, source.name, position)
+        positions[frame.index] = position
         left_out.add(frame)
         collector.add(frame)
         if frame.scan is not None:
@@ -356,6 +361,7 @@ def prepare_drive(
         left_out,
         collector.statistics(),
         sweep,
+        frames=NumberedFrames(source, positions),
     )
 
 

@@ -8,6 +8,9 @@ half-samples.
 
 A lens that is contradicted is a reason against the estimate where it matters: where the estimate moves
 farther than it is known when the lens is free. Where it moves less far, that step is added to the covariance.
+
+An estimate by labels is tested, too, by edges of some of its frames: those know the principal point several
+times as well as the outlines of a few vehicles.
 """
 
 from __future__ import annotations
@@ -18,20 +21,27 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.association.time_pairing import pair_by_time
 from sst_graph.assumptions import ASSUMPTIONS, named_sigmas
 from sst_graph.batch.assumption_tests import ParameterTest, few_objects_factor
 from sst_graph.batch.by_edges.covariance import half_sample_steps
 from sst_graph.batch.by_edges.optimum import START_KERNELS_PX
+from sst_graph.batch.by_edges.problem import LabelEstimate, edges_problem
 from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX, solution_steps
+from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.covariance.shared_errors import FEWEST
+from sst_graph.drive.edges_of_frames import with_edges
+from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.matching import edges_of, match_all
 from sst_graph.graph.outer_loop import JointProblem, support_of
 from sst_graph.graph.state import State, difference
 from sst_graph.objects.tracks import ObjectId
-from sst_graph.stepwise import Stepwise
+from sst_graph.sampling import evenly_spread
+from sst_graph.stepwise import Stepwise, run_to_end
+from sst_graph.types import Guess
 
 FloatArray = NDArray[np.float64]
 
@@ -45,6 +55,16 @@ _LOST = 0.99
 """A solution that meets fewer edges than this share of the estimate's, which is one with the right lens, is
 another optimum: wide kernels have led there, past edges that lie closer. Where the lens is wrong, more are
 met (by 1 to 13 %), and two solutions of one optimum differ by less than 0.1 %."""
+
+
+_SCANS = 20
+"""Scans of all drives that test the lens of an estimate by labels: two to four seconds."""
+_BESIDE_LABELS = ("cx", "cy")
+"""What they test of it. Outlines of a few vehicles know the principal point to 3 to 9 px, edges of these
+scans to 1 to 5 px. Of focal length and k1 labels know enough, and KITTI's pictures, which are not quite those
+of their pinhole, would refuse estimates that this moves by less than their sigmas."""
+_APART_S = 0.3
+"""They come in pairs so far apart, so that objects are tracked from one to the other [s]."""
 
 
 @dataclass(frozen=True)
@@ -134,8 +154,11 @@ def lens_steps(
 
 
 def _near(problem: JointProblem, start: State) -> Stepwise[State]:
-    """The solution by near edges; soft matches follow the pose, so they are gone through twice."""
-    first = yield from solution_steps(problem, start, NEAR_KERNELS_PX)
+    """The solution by near edges. Soft matches follow a wrong lens, so points are matched to the peaks of
+    their edges first, to which few steps lead."""
+    graph = replace(problem.config.graph, edge_place="peak")
+    by_peaks = replace(problem, config=replace(problem.config, graph=graph))
+    first = yield from solution_steps(by_peaks, start, NEAR_KERNELS_PX)
     return (yield from solution_steps(problem, first.state, NEAR_KERNELS_PX)).state
 
 
@@ -153,3 +176,40 @@ def _finding(name: str, value: float, steps: FloatArray, threshold: float) -> Pa
         return None
     sigma = max(float(known.std(ddof=1)), 1e-12) * few_objects_factor(len(known), threshold)
     return ParameterTest(ASSUMPTIONS[name], value, sigma, abs(value) > threshold * sigma)
+
+
+def lens_beside_labels(problem: CalibrationProblem, state: State) -> tuple[ParameterTest, ...]:
+    """Tests of the principal point of an estimate by labels, by edges of some frames.
+
+    Raises:
+        DataError: a frame cannot be read again.
+    """
+    # 1. Some frames once more, for their edges.
+    most = max(2, _SCANS // len(problem.drives))
+    drives, offsets_s = [], []
+    for number, drive in enumerate(problem.drives):
+        offset_s = state.time_offset_s(number)
+        own = with_edges(drive, _some_pairs(drive, offset_s, most), problem.config.prepare)
+        if own is not None:
+            drives.append(own)
+            offsets_s.append(offset_s)
+    if not drives:
+        return ()
+    # 2. The lens by these, from the estimate. Objects in so few scans have no bias of their own.
+    clocks = tuple(offsets_s[: len(state.time_offsets_s)])
+    held = State(state.cTl, clocks, nuisances=dict(state.nuisances))
+    noise = replace(problem.config.noise, object_bias_sigma_px=0.0)
+    config, guess = replace(problem.config, noise=noise), Guess(state.cTl, offsets_s[0])
+    calibration = CalibrationProblem.of(drives, guess, config)
+    edges = edges_problem(calibration, None, LabelEstimate(held, True)).whole
+    found = run_to_end(lens_steps(edges, held, calibration.objects, problem.config.assumptions))
+    return tuple(each for each in found.findings if each.assumption.name in _BESIDE_LABELS)
+
+
+def _some_pairs(drive: Drive, time_offset_s: float, most: int) -> list[tuple[int, int]]:
+    """Scans with their images in true time: pairs of scans, spread over the drive."""
+    found = pair_by_time(drive.scan_stamps_ns, drive.image_stamps_ns, time_offset_s, drive.image_period_s)
+    apart = max(1, round(_APART_S / drive.scan_period_s))
+    firsts = evenly_spread(range(max(1, len(found) - apart)), most // 2)
+    chosen = sorted({k for first in firsts for k in (first, first + apart) if k < len(found)})
+    return [(found[k].scan, found[k].image) for k in chosen]
