@@ -96,8 +96,8 @@ class Chart:
         self, x: ArrayLike, y: ArrayLike, colour: str, size: float = 2.5, titles: Sequence[str] = ()
     ) -> None:
         """Points, of a radius; titles are shown under the pointer."""
-        style: dict[str, Any] = {"color": _COLOURS[colour], "s": (2.0 * size) ** 2, "lw": 0, "zorder": 3}
-        style["clip_on"] = False
+        style: dict[str, Any] = {"color": _COLOURS[colour], "s": (2.0 * size) ** 2, "lw": 0}
+        style |= {"zorder": 3, "clip_on": False}
         self._add(f"dots {colour}", lambda axes, gid: axes.scatter(x, y, gid=gid, **style), titles)
 
     def band(self, x: ArrayLike, low: ArrayLike, high: ArrayLike, colour: str, name: str = "") -> None:
@@ -113,7 +113,7 @@ class Chart:
     ) -> None:
         """Bars from 0 to the heights, about x; width in data units."""
         xs, ys = np.asarray(x, np.float64), np.asarray(heights, np.float64)
-        corners = np.stack(
+        corners: Any = np.stack(
             [
                 np.stack([xs + side * width, end], axis=-1)
                 for side, end in ((-0.5, 0.0 * ys), (-0.5, ys), (0.5, ys), (0.5, 0.0 * ys))

@@ -149,10 +149,6 @@ def test_charts_have_no_ids_and_take_their_colours_from_the_page(by: str) -> Non
     assert "<?xml" not in page and page.count("<!DOCTYPE") == 1
 
 
-def test_the_page_is_the_same_again() -> None:
-    assert report_html(ReportInputs(_result(), [crowded_street()])) == _page()
-
-
 PROBE = (
     "<script>addEventListener('load', () => setTimeout(() => { parent.document.title = JSON.stringify({"
     "wide: document.documentElement.scrollWidth, window: innerWidth, "
