@@ -45,7 +45,7 @@ def convergence_chart(fit: Fit, result: CalibrationResult) -> str:
     chart = Chart(
         (1, len(iterations)),
         (np.log10(_LEAST_SIGMAS), top),
-        ("outer iteration", "distance to the result, log10 of sigmas"),
+        ("outer iteration", "distance, log10 of sigmas"),
         "Distance to the result in each outer iteration",
     )
     chart.level(0.0, "one sigma")
