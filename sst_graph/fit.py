@@ -145,13 +145,13 @@ class OuterIteration:
     """One outer iteration of the solution.
 
     Attributes:
-        kernel_px: scale of the robust kernel [px].
-        matches: number of matches.
+        kernel_px: scale of the robust kernel [px]; None of motions.
+        matches: number of matches, or of pairs of motions.
         cTl: extrinsic after it.
         time_offset_s: (first) time offset after it [s].
     """
 
-    kernel_px: float
+    kernel_px: float | None
     matches: int
     cTl: gtsam.Pose3
     time_offset_s: float

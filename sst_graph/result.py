@@ -161,6 +161,11 @@ class CalibrationResult:
         topic = self.read_as.get("image_topic")
         return topic if isinstance(topic, str) else ""
 
+    @property
+    def fit_is_check(self) -> bool:
+        """Whether the fit is that of data which the estimate has not used."""
+        return self.method == "motion"
+
     def sigmas(self) -> Sigmas:
         """Standard deviations of the seven unknowns, in degrees, centimetres and milliseconds."""
         sigma = np.sqrt(np.diag(self.covariance))

@@ -23,6 +23,8 @@ _PLACES = 3
 DRIVING_MPS = 10.0
 """Speed, straight ahead, for which the error is given besides that at rest [m/s]."""
 
+CHECK_BY_EDGES = "a check by edges of the pictures, which the estimate has not used"
+
 
 @dataclass(frozen=True)
 class Misfit:
@@ -86,6 +88,8 @@ def fit_line(result: CalibrationResult) -> str:
     quality = FitQuality.from_diagnostics(result.diagnostics)
     if quality is None:
         return edges_line(result)
+    if result.fit_is_check:
+        return f"{CHECK_BY_EDGES}: {quality_line(quality)}"
     contrast = "" if quality.by_chance is None else edges_line(result)
     return "; ".join(line for line in (contrast, quality_line(quality)) if line)
 

@@ -118,7 +118,7 @@ def calibrate_rig_prepared(
         guesses: of every camera.
     """
     config = replace(
-        with_method_of(config, [drive for own in drives.values() for drive in own]), profiles=False
+        with_method_of(config, [drive for own in drives.values() for drive in own]), for_report=False
     )
     # 1. Each camera by itself, on the same LiDAR features, odometry and object tracks.
     problems = _problems(drives, guesses, config, progress)

@@ -4,6 +4,7 @@ labels."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -77,7 +78,8 @@ def edges_method(
         reasons += halves_reasons(problem.whole, solution.state, covariance)
     # 6. How it fits the pictures, point by point.
     first = [one for _, one in candidates[:1]]
-    fit = fit_of_edges(calibration, (*first, solution), covariance)
+    matched = replace(calibration, drives=problem.whole.drives)
+    fit = fit_of_edges(matched, (*first, solution), covariance)
     return MethodEstimate(
         solution.state.cTl,
         solution.state.time_offsets_s[0],
