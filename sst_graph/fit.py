@@ -28,8 +28,8 @@ close under the right calibration, and few under one that is 0.3 deg off."""
 MOST_POINTS = 30_000
 """Most boundary points that are kept; with more, every second, third, ... is."""
 
-QUALITY = "fit_quality"
-"""Entry of a result's diagnostics."""
+QUALITY, EDGES_QUALITY = "fit_quality", "fit_quality_of_edges"
+"""Entries of a result's diagnostics: of its fit, and of that of the edges where there are labels beside."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,9 @@ class FitQuality:
         return {"within_px": CLOSE_PX, **asdict(self)}
 
     @classmethod
-    def from_diagnostics(cls, diagnostics: Mapping[str, Any]) -> FitQuality | None:
-        """That of a result's diagnostics; None where there is none, or none that can be read."""
-        entry = diagnostics.get(QUALITY)
+    def from_diagnostics(cls, diagnostics: Mapping[str, Any], name: str = QUALITY) -> FitQuality | None:
+        """An entry of a result's diagnostics; None where there is none, or none that can be read."""
+        entry = diagnostics.get(name)
         if not isinstance(entry, Mapping):
             return None
         points, optional = entry.get("points"), [entry.get(name) for name in ("share_at_start", "by_chance")]

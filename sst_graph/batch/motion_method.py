@@ -1,4 +1,4 @@
-"""``--method motion``: the hand-eye solution as a method of ``calibrate``, judged by edges of the pictures."""
+"""``--method motion``: the hand-eye solution as a method of ``calibrate``, judged by edges."""
 
 from __future__ import annotations
 

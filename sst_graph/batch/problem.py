@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -137,6 +138,27 @@ class CalibrationProblem:
         starts = [State(cTl, (time_offset_s,) * clocks) for cTl, time_offset_s in selection.starts]
         centred = [(start, self.prior_centre(start)) for start in starts]
         return solve_all(self.joint(), centred, kernels_px, self.progress)
+
+
+@dataclass(frozen=True)
+class MatchedDrives:
+    """What an estimate was matched with: how other calibrations fit the same can be measured.
+
+    Attributes:
+        problem: drives with the boundary points that were matched.
+        state: the estimate, with the mask biases.
+    """
+
+    problem: CalibrationProblem
+    state: State
+
+    def started_at(self, guess: Guess) -> MatchedDrives:
+        """The same beside another start."""
+        return replace(self, problem=replace(self.problem, guess=guess))
+
+    def fit_at(self, cTl: gtsam.Pose3, time_offset_s: float) -> Fit | None:
+        """The fit of a calibration with one time offset, under the same mask biases."""
+        return self.problem.fit_at(replace(self.state, cTl=cTl, time_offsets_s=(time_offset_s,)))
 
 
 @dataclass(frozen=True)

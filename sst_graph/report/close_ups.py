@@ -170,7 +170,10 @@ def _close_up(
     worst = "edges agree least" if by_edges else "labels agree least"
     telling = "tells most" if result.fit_is_check else "determines most"
     title = f"{class_name} at {range_m:.0f} m, {worst if detection.worst else telling}"
-    information = "" if result.fit_is_check else f"{100.0 * detection.share:.1f} % of the information. "
+    of_kind = f" of the {'edges' if by_edges else 'labels'}" if len(result.fits) > 1 else ""
+    information = f"{100.0 * detection.share:.1f} % of the information{of_kind}. "
+    if result.fit_is_check:
+        information = ""
     sides = ", ".join(
         f"{_SIDE_NAMES[side]} {_mean(points, points.sides == side):+.1f} px"
         for side in np.unique(points.sides)

@@ -19,7 +19,7 @@ from sst_graph.batch.by_edges.reasons import EdgeContrast, edge_contrast, edges_
 from sst_graph.batch.by_edges.solution import WIDER_KERNEL_PX
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import MethodEstimate, frames_used
-from sst_graph.batch.problem import CalibrationProblem, JointEstimate
+from sst_graph.batch.problem import CalibrationProblem, JointEstimate, MatchedDrives
 from sst_graph.batch.total_covariance import sweep_effects
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.graph.outer_loop import JointSolution, solve_joint
@@ -92,6 +92,7 @@ def edges_method(
         | {"spread": {**own.sigmas, "farther_edges": np.abs(wider_step).tolist()}}
         | {"assumptions": dict(own.assumptions), "estimated": dict(own.estimated)},
         fit=fit,
+        matched=MatchedDrives(matched, solution.state),
         by_sweeps=sweeps.covariance,
         sweep_reasons=sweeps.reasons,
         shared=own.shared,
