@@ -66,7 +66,7 @@ _EDGES_HINT = (
     "beside its outline, to the same side in several pictures, is a wrong one."
 )
 _CHECK = (
-    "Under a right calibration the share is 1.4 to 2 times that at random rotations. It judges all of the "
+    "Under a right calibration the share is 1.3 to 2 times that at random rotations. It judges all of the "
     "result: a few centimetres or a roll that motion leaves open take it down to chance. Where it is lower "
     "than at the start, the start is the better calibration."
 )
