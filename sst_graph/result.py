@@ -116,6 +116,7 @@ class CalibrationResult:
         diagnostics: JSON-able numbers about the run.
         versions: of the packages that took part.
         fit: how the result fits its data, point by point; in memory only, and None of a result from a file.
+        edges_fit: the same of edges in frames without labels, where ``fit`` is of the labels in the others.
     """
 
     T_camera_lidar: gtsam.Pose3
@@ -136,6 +137,7 @@ class CalibrationResult:
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
     fit: Fit | None = field(default=None, repr=False)
+    edges_fit: Fit | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         _check_status(self.status)
@@ -160,6 +162,16 @@ class CalibrationResult:
         """Topic of the images in a bag; empty where they came from elsewhere."""
         topic = self.read_as.get("image_topic")
         return topic if isinstance(topic, str) else ""
+
+    @property
+    def fits(self) -> tuple[Fit, ...]:
+        """``fit`` and ``edges_fit``, those that are there."""
+        return tuple(fit for fit in (self.fit, self.edges_fit) if fit is not None)
+
+    @property
+    def fit_is_check(self) -> bool:
+        """Whether the fit is that of data which the estimate has not used."""
+        return self.method == "motion"
 
     def sigmas(self) -> Sigmas:
         """Standard deviations of the seven unknowns, in degrees, centimetres and milliseconds."""

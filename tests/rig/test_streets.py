@@ -188,6 +188,7 @@ def test_a_camera_without_masks_has_its_pose_from_the_other() -> None:
     right = result["right"]
     assert result["left"].status == "ok" and right.status == "ok"
     assert right.reasons[0].startswith("its own images give no estimate")
+    assert right.fit is None and result["left"].fit is not None
     assert right.T_camera_lidar.equals(_true_pose() * result["left"].T_camera_lidar, 1e-6)
     unknown = calibrate_rig_prepared(both, guesses, CalibrationConfig(), KnownRig())
     assert unknown["right"].status == "unobservable" and unknown["left"].status == "ok"
