@@ -22,7 +22,7 @@ from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.files.checked_values import check_covariance, check_finite, checked_text, pinhole_camera
 from sst_graph.files.json_table import JsonTable, json_table
-from sst_graph.files.reading import CALIBRATION, parse_json, read_text
+from sst_graph.files.reading import CALIBRATION, parse_json, path_of, read_text
 from sst_graph.files.strict_json import strict_json
 from sst_graph.fit import Fit
 from sst_graph.types import ByValue
@@ -262,7 +262,7 @@ def read_result(path: str | Path) -> CalibrationResult:
     Raises:
         DataError: the file is missing, unreadable or not such a file.
     """
-    file = file_of_one_camera(Path(path))
+    file = file_of_one_camera(path_of(path, "a calibration.json"))
     return CalibrationResult.from_json(read_text(file, CALIBRATION), file)
 
 

@@ -83,6 +83,8 @@ def calibrate_rig(
     """
     known = KnownRig() if known is None else known
     checked_type("cameras", cameras, Mapping, "a dict of sources by the camera's name")
+    for name in cameras:
+        checked_type("name of a camera", name, str, "a text")
     checked_type("known", known, KnownRig, "a KnownRig, or None")
     sources = {name: as_sources(own) for name, own in cameras.items()}
     guesses = _guesses(list(sources), initial or {}, initial_time_offsets_s or {})

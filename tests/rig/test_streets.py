@@ -255,6 +255,7 @@ def test_settings_that_a_rig_has_not(overrides: list[str], found: str) -> None:
         ({"cameras": None}, "cameras: found None, expected a dict"),
         ({"cameras": [1, 2]}, "cameras: found a list"),
         ({"cameras": {"left": 7}}, "frames to calibrate"),
+        ({"cameras": {7: None}}, "name of a camera: found 7"),
         ({"initial": gtsam.Pose3()}, "initial: found a Pose3"),
         ({"initial": {"lift": None}}, "initial: found a guess of 'lift', expected of left, right"),
         ({"initial": {"left": 7}}, "initial: found a int"),
