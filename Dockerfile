@@ -11,10 +11,12 @@ RUN python -m pip wheel --no-cache-dir --no-deps -w /wheels .
 FROM python:3.12-slim
 COPY --from=build /wheels /wheels
 RUN set -- /wheels/*.whl \
-    && python -m pip install --no-cache-dir "$1[plot,ros,yaml,onnx]" \
+    && python -m pip install --no-cache-dir "$1[ros,yaml,onnx]" \
     && useradd --create-home --uid 1000 calibration
 # Many small matrices: threads only get in each other's way.
-ENV OMP_NUM_THREADS=1 MPLCONFIGDIR=/tmp/matplotlib
+ENV OMP_NUM_THREADS=1 MPLCONFIGDIR=/var/cache/matplotlib
+# matplotlib looks for the fonts once, here; any user may run the image.
+RUN mkdir $MPLCONFIGDIR && python -c "import matplotlib.font_manager" && chmod -R a+rwX $MPLCONFIGDIR
 USER calibration
 WORKDIR /data
 ENTRYPOINT ["sst-graph"]

@@ -9,7 +9,7 @@ processor seconds and largest resident memory count. ``prepare`` reads the frame
 extrinsic. ``--whole`` adds ``whole estimate``, what ``calibrate`` does after prepare from the nominal
 extrinsic, without the search for causes: how many searches and tests it makes depends on what it finds, and
 its status stands beside it. OUT gets scaling.md, a table for each question with log-log slopes (of all sizes,
-by least squares, and between the last two), and scaling.svg (extra ``plot``). Work that does not grow makes
+by least squares, and between the last two), and scaling.svg. Work that does not grow makes
 the slope of small sizes flatter; the last two say more about larger ones.
 
 Frames are those of a street of 41, played forth and back under rising stamps (a drive reversed in time is a

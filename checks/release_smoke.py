@@ -5,7 +5,7 @@
 For every Python and for the newest and the oldest versions of the dependencies that pyproject.toml
 allows: ``sst-graph --version``, the import of every module, ``simulate`` and ``calibrate`` (which must end
 with status ok); with the extra ros, ``info`` and ``calibrate`` of a bag of the same drive (status ok, too);
-with plot, yaml and onnx added, ``inspect --plots``. The extra hf (PyTorch) is left out for its size.
+with yaml and onnx added, ``inspect --plots``. The extra hf (PyTorch) is left out for its size.
 
 Needs ``build`` and ``uv`` (the extra ``release``) and a package index.
 """
@@ -31,7 +31,7 @@ UV = (sys.executable, "-m", "uv")
 PYTHONS = ("3.11", "3.12", "3.13")
 RESOLUTIONS = ("highest", "lowest-direct")
 IMAGE, MASK = "/camera/image_rect", "/camera/mask"  # of write_bag
-EXTRAS = ("ros", "plot", "yaml", "onnx")
+EXTRAS = ("ros", "yaml", "onnx")
 IN_SDIST = (
     "docs/develop/layout.md",
     "notebooks/",

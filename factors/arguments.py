@@ -65,8 +65,10 @@ def as_numbers(what: str, value: ArrayLike, shape: str = "") -> FloatArray:
     Args:
         shape: that is expected, for the message.
     """
+    if (masked := masked_values(value)) > 0:
+        raise FactorError(what, f"{masked} masked values", "an array without a mask")
     if isinstance(value, np.ndarray) and value.dtype == np.float64:
-        return value
+        return np.asarray(value)
     expected = f"numbers of shape {shape}" if shape else "numbers"
     try:
         array = np.asarray(value)
@@ -75,6 +77,11 @@ def as_numbers(what: str, value: ArrayLike, shape: str = "") -> FloatArray:
         return np.asarray(array, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         raise FactorError(what, described(value), expected) from None
+
+
+def masked_values(value: object) -> int:
+    """Number of values that the mask of a masked array hides; 0 of anything else."""
+    return int(np.count_nonzero(np.ma.getmaskarray(value))) if isinstance(value, np.ma.MaskedArray) else 0
 
 
 def checked_finite(what: str, array: FloatArray) -> None:

@@ -36,13 +36,16 @@ class PinholeCamera:
     height: int
 
     def __post_init__(self) -> None:
+        plain: dict[str, float] = {}
         for name in ("fx", "fy"):
-            checked_positive(f"{name} of PinholeCamera", getattr(self, name))
+            plain[name] = checked_positive(f"{name} of PinholeCamera", getattr(self, name))
         for name in ("cx", "cy"):
-            checked_number(f"{name} of PinholeCamera", getattr(self, name))
+            plain[name] = checked_number(f"{name} of PinholeCamera", getattr(self, name))
         for name in ("width", "height"):
             side = getattr(self, name)
-            checked_count(f"{name} of PinholeCamera", side, "a whole number of pixels above 0")
+            plain[name] = checked_count(f"{name} of PinholeCamera", side, "a whole number of pixels above 0")
+        for name, number in plain.items():  # of NumPy's types, whole numbers overflow and arrays have no hash
+            object.__setattr__(self, name, number)
 
     @property
     def matrix(self) -> FloatArray:

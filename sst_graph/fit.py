@@ -28,8 +28,8 @@ close under the right calibration, and few under one that is 0.3 deg off."""
 MOST_POINTS = 30_000
 """Most boundary points that are kept; with more, every second, third, ... is."""
 
-QUALITY = "fit_quality"
-"""Entry of a result's diagnostics."""
+QUALITY, EDGES_QUALITY = "fit_quality", "fit_quality_of_edges"
+"""Entries of a result's diagnostics: of its fit, and of that of the edges where there are labels beside."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,9 @@ class FitQuality:
         return {"within_px": CLOSE_PX, **asdict(self)}
 
     @classmethod
-    def from_diagnostics(cls, diagnostics: Mapping[str, Any]) -> FitQuality | None:
-        """That of a result's diagnostics; None where there is none, or none that can be read."""
-        entry = diagnostics.get(QUALITY)
+    def from_diagnostics(cls, diagnostics: Mapping[str, Any], name: str = QUALITY) -> FitQuality | None:
+        """An entry of a result's diagnostics; None where there is none, or none that can be read."""
+        entry = diagnostics.get(name)
         if not isinstance(entry, Mapping):
             return None
         points, optional = entry.get("points"), [entry.get(name) for name in ("share_at_start", "by_chance")]
@@ -145,13 +145,13 @@ class OuterIteration:
     """One outer iteration of the solution.
 
     Attributes:
-        kernel_px: scale of the robust kernel [px].
-        matches: number of matches.
+        kernel_px: scale of the robust kernel [px]; None of motions.
+        matches: number of matches, or of pairs of motions.
         cTl: extrinsic after it.
         time_offset_s: (first) time offset after it [s].
     """
 
-    kernel_px: float
+    kernel_px: float | None
     matches: int
     cTl: gtsam.Pose3
     time_offset_s: float

@@ -22,7 +22,7 @@ from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.files.checked_values import check_covariance, check_finite, checked_text, pinhole_camera
 from sst_graph.files.json_table import JsonTable, json_table
-from sst_graph.files.reading import CALIBRATION, parse_json, read_text
+from sst_graph.files.reading import CALIBRATION, parse_json, path_of, read_text
 from sst_graph.files.strict_json import strict_json
 from sst_graph.fit import Fit
 from sst_graph.types import ByValue
@@ -116,6 +116,7 @@ class CalibrationResult:
         diagnostics: JSON-able numbers about the run.
         versions: of the packages that took part.
         fit: how the result fits its data, point by point; in memory only, and None of a result from a file.
+        edges_fit: the same of edges in frames without labels, where ``fit`` is of the labels in the others.
     """
 
     T_camera_lidar: gtsam.Pose3
@@ -136,6 +137,7 @@ class CalibrationResult:
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
     fit: Fit | None = field(default=None, repr=False)
+    edges_fit: Fit | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         _check_status(self.status)
@@ -160,6 +162,16 @@ class CalibrationResult:
         """Topic of the images in a bag; empty where they came from elsewhere."""
         topic = self.read_as.get("image_topic")
         return topic if isinstance(topic, str) else ""
+
+    @property
+    def fits(self) -> tuple[Fit, ...]:
+        """``fit`` and ``edges_fit``, those that are there."""
+        return tuple(fit for fit in (self.fit, self.edges_fit) if fit is not None)
+
+    @property
+    def fit_is_check(self) -> bool:
+        """Whether the fit is that of data which the estimate has not used."""
+        return self.method == "motion"
 
     def sigmas(self) -> Sigmas:
         """Standard deviations of the seven unknowns, in degrees, centimetres and milliseconds."""
@@ -250,7 +262,7 @@ def read_result(path: str | Path) -> CalibrationResult:
     Raises:
         DataError: the file is missing, unreadable or not such a file.
     """
-    file = file_of_one_camera(Path(path))
+    file = file_of_one_camera(path_of(path, "a calibration.json"))
     return CalibrationResult.from_json(read_text(file, CALIBRATION), file)
 
 

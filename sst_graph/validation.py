@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
+from sst_graph.factors.arguments import described, masked_values
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.files.checked_values import checked_pose, checked_time_offset_s, pinhole_camera
 from sst_graph.types import NO_PICTURE, CameraImage, Frame, PixelStretch, Scan, SemanticClass
@@ -64,7 +65,7 @@ def checked_scan(scan: object, place: str = "scan", fewest: int = 1) -> Scan:
         offsets_s = _reals(times, LONGEST_SWEEP_S, f"{place}: point times", "s after the stamp")
     left_out = scan.left_out
     if not isinstance(left_out, int | np.integer) or left_out < 0:
-        raise DataError(f"{place}: left_out", f"{left_out!r:.60}", "a number of points")
+        raise DataError(f"{place}: left_out", described(left_out), "a number of points")
     return Scan(stamp_ns, points, classes, instances, offsets_s, rings, int(left_out))
 
 
@@ -203,6 +204,8 @@ def _array(value: object, shape: tuple[int | None, ...], place: str, why: str = 
     if not fits:
         wanted = f"({', '.join('n' if length is None else str(length) for length in shape)})"
         raise DataError(place, f"shape {value.shape}", f"{wanted}{f', {why}' if why else ''}")
+    if (masked := masked_values(value)) > 0:
+        raise DataError(place, f"{masked} masked values", "an array without a mask: leave them out")
     return np.asarray(value)
 
 

@@ -37,7 +37,7 @@ from sst_graph.batch.method_estimate import (
 from sst_graph.batch.motion_factor import may_use_motion, with_motion
 from sst_graph.batch.motion_method import motion_method
 from sst_graph.batch.part_solver import PartSolver
-from sst_graph.batch.problem import CalibrationProblem, JointEstimate, JointOutcome
+from sst_graph.batch.problem import CalibrationProblem, JointEstimate, JointOutcome, MatchedDrives
 from sst_graph.batch.sources import as_sources
 from sst_graph.batch.total_covariance import total_covariance
 from sst_graph.config import expect_settings
@@ -217,8 +217,9 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
         | joint_diagnostics(problem, motion.estimate, lower),
         JointOutcome(problem, motion.estimate, considered),
         fit,
-        total.by_sweeps,
-        total.reasons,
+        matched=MatchedDrives(problem, solution.state),
+        by_sweeps=total.by_sweeps,
+        sweep_reasons=total.reasons,
     )
 
 

@@ -36,7 +36,8 @@ class CalibrationConfig(Settings):
         unknown_motion: what the covariance has beside that of the matches where a single scan does not show
             motion; both 0 where the vehicle stood.
         observability: when a direction counts as unobservable.
-        profiles: whether likelihoods along the unknowns are computed, for a report.
+        for_report: whether what a report alone shows is computed: likelihoods along the unknowns, and how an
+            estimate by motion fits edges of the pictures.
     """
 
     method: Method = setting(
@@ -89,7 +90,7 @@ class CalibrationConfig(Settings):
         True,
         doc="Test whether drives, and parts of a drive, contradict one another. Set to false to save time.",
     )
-    profiles: bool = internal(True)
+    for_report: bool = internal(True)
     check_stamps: bool = setting(
         True,
         doc="Report a result as not converged where a sensor's stamps jump. Set to false for sensors "
@@ -135,7 +136,9 @@ class CalibrationConfig(Settings):
 
 
 def prepared_classes(config: CalibrationConfig) -> tuple[SemanticClass, ...]:
-    """Classes that drives are prepared with: edges need objects of no class."""
+    """Classes that drives are prepared with: edges need objects of no class, motion is judged by them."""
     if config.method == "edges":
         return (SemanticClass.OBJECT,)
+    if config.method == "motion":
+        return (SemanticClass.OBJECT,) if config.for_report else ()
     return (*config.classes, SemanticClass.OBJECT) if config.method == "both" else config.classes

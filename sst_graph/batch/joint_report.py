@@ -19,7 +19,6 @@ from sst_graph.initialization.selection import ALTERNATIVE_RATIO, REACH
 from sst_graph.inspect.frame_gains import frame_gains
 from sst_graph.inspect.frame_information import KEY as FRAME_INFORMATION
 from sst_graph.inspect.frame_information import to_document
-from sst_graph.quality.fit_of_solution import FitOfDrives
 from sst_graph.quality.profiles import profiles
 
 FloatArray = NDArray[np.float64]
@@ -103,11 +102,10 @@ def fit_of(
     different = {id(solution): solution for solution in solutions}.values()
     iterations = [each for solution in different for each in solution.iterations]
     along: Sequence[Profile] = ()
-    if problem.config.profiles:
+    if problem.config.for_report:
         sigmas, matches = np.sqrt(np.diag(covariance)), sum(map(len, last.matches))
         along = profiles(last.frozen, last.optimum, sigmas, matches)
-    drives = FitOfDrives(problem.drives, problem.tracks, problem.objects, problem.config.joint.graph)
-    return drives.fit(last.state, problem.at_guess(last.state), iterations, along)
+    return problem.fit_at(last.state, iterations, along)
 
 
 def _moving(solution: JointSolution) -> Iterator[str]:

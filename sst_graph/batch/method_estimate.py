@@ -25,7 +25,7 @@ from sst_graph.covariance.observability import (
 from sst_graph.covariance.shared_errors import SharedErrors
 from sst_graph.drive.preparation import Drive
 from sst_graph.drive.stamp_intervals import jumps_of
-from sst_graph.fit import QUALITY, Fit
+from sst_graph.fit import EDGES_QUALITY, QUALITY, Fit
 from sst_graph.graph.outer_loop import JointSolution
 from sst_graph.graph.state import State
 from sst_graph.odometry.sweep import SWEEP_KEY
@@ -33,7 +33,7 @@ from sst_graph.result import CalibrationResult, DriveOffset, FrameId, Status, We
 from sst_graph.types import Guess
 
 if TYPE_CHECKING:
-    from sst_graph.batch.problem import JointOutcome
+    from sst_graph.batch.problem import JointOutcome, MatchedDrives
 
 FloatArray = NDArray[np.float64]
 
@@ -73,6 +73,8 @@ class MethodEstimate:
         diagnostics: JSON-able numbers about the run.
         solved: the problem of the joint graph with its matches; None of methods without such a graph.
         fit: how the estimate fits its data, of methods that measure it.
+        edges_fit: the same of edges in other frames, where ``fit`` is of labels.
+        matched: what it was matched with, of methods that match.
         by_sweeps: (7, 7) part of the covariance by sweeps that the scans leave undecided.
         sweep_reasons: those of the reasons that say that such sweeps matter.
         shared: errors that other cameras on the LiDAR have, too, of methods without ``solved``.
@@ -90,6 +92,8 @@ class MethodEstimate:
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
     solved: JointOutcome | None = None
     fit: Fit | None = None
+    edges_fit: Fit | None = None
+    matched: MatchedDrives | None = None
     by_sweeps: FloatArray = field(default_factory=lambda: np.zeros((7, 7)))
     sweep_reasons: tuple[str, ...] = ()
     shared: SharedErrors | None = None
@@ -119,14 +123,20 @@ def result_of(
         config=to_dict(config),
         initial=guess.cTl,
         initial_time_offset_s=guess.time_offset_s,
-        diagnostics={**estimate.diagnostics, **_quality(estimate.fit), **sweeps_of(drives)},
+        diagnostics={**estimate.diagnostics, **_qualities(estimate), **sweeps_of(drives)},
         versions=_versions(),
         fit=estimate.fit,
+        edges_fit=estimate.edges_fit,
     )
 
 
-def _quality(fit: Fit | None) -> dict[str, Any]:
-    return {} if fit is None else {QUALITY: fit.quality.to_dict()}
+def _qualities(estimate: MethodEstimate) -> dict[str, Any]:
+    return {**quality_of(estimate.fit), **quality_of(estimate.edges_fit, EDGES_QUALITY)}
+
+
+def quality_of(fit: Fit | None, name: str = QUALITY) -> dict[str, Any]:
+    """The shares of a fit, as an entry of the diagnostics."""
+    return {} if fit is None else {name: fit.quality.to_dict()}
 
 
 def _weak_directions(

@@ -1,4 +1,4 @@
-"""``--method motion``: the hand-eye solution as a method of ``calibrate``."""
+"""``--method motion``: the hand-eye solution as a method of ``calibrate``, judged by edges."""
 
 from __future__ import annotations
 
@@ -6,12 +6,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sst_graph.batch.by_edges.problem import with_fewer_points
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import MethodEstimate
+from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.drive.preparation import Drive, Progress
+from sst_graph.fit import Fit
 from sst_graph.graph.state import difference
 from sst_graph.hand_eye.solution import MotionSolution, alternative, solve_motion
 from sst_graph.inspect.gained import KEY, pair_gains, to_document
+from sst_graph.quality.fit_of_solution import has_edges
 from sst_graph.result import FrameId
 from sst_graph.types import Guess
 
@@ -20,6 +24,8 @@ def motion_method(
     drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
 ) -> MethodEstimate:
     """LiDAR odometry against visual odometry; labels only leave out what may move.
+
+    The estimate uses no edges. Those of drives that were prepared with some judge it: its fit is theirs.
 
     Raises:
         EstimationError: too few consecutive frames with known motion.
@@ -43,7 +49,18 @@ def motion_method(
             "turned_deg": _turned_deg(best),
             KEY: to_document(gained),
         },
+        fit=check_by_edges(drives, guess, config, best) if config.for_report else None,
     )
+
+
+def check_by_edges(
+    drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, solution: MotionSolution
+) -> Fit | None:
+    """How a solution, which has used no edge, fits those of the pictures; None of drives that have none."""
+    if not has_edges(drives):
+        return None
+    problem = with_fewer_points(CalibrationProblem.of(drives, guess, config))
+    return problem.fit_at(solution.state, solution.iterations)
 
 
 def _turned_deg(solution: MotionSolution) -> float:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +16,7 @@ from sst_graph.covariance.cluster_robust import RobustCovariance, robust_covaria
 from sst_graph.covariance.considered import AssumptionConfig, Considered, considered_by_matches
 from sst_graph.covariance.static_objects import static_covariance
 from sst_graph.drive.preparation import Drive, Progress
+from sst_graph.fit import Fit, OuterIteration, Profile
 from sst_graph.graph.matching import GraphConfig, Tracks
 from sst_graph.graph.outer_loop import (
     KERNELS_PX,
@@ -26,6 +29,7 @@ from sst_graph.graph.state import State
 from sst_graph.initialization.candidates import StartProblem, prior_centre
 from sst_graph.initialization.selection import Selection, alternatives, select_start_steps
 from sst_graph.objects.tracks import ObjectId, object_tracks
+from sst_graph.quality.fit_of_solution import FitOfDrives
 from sst_graph.stepwise import run_to_end
 from sst_graph.types import Guess
 
@@ -79,6 +83,23 @@ class CalibrationProblem:
         offsets_s = (self.guess.time_offset_s,) * len(state.time_offsets_s)
         return replace(state, cTl=self.guess.cTl, time_offsets_s=offsets_s)
 
+    @cached_property
+    def fit_of_drives(self) -> FitOfDrives:
+        """What measures how states fit the drives: their labels, or edges of their pictures."""
+        graph = self.config.joint.graph
+        return FitOfDrives(self.drives, self.tracks, self.objects, graph, self.config.seed)
+
+    def fit_at(
+        self, state: State, iterations: Sequence[OuterIteration] = (), profiles: Sequence[Profile] = ()
+    ) -> Fit | None:
+        """How a state fits the drives; None where no boundary point has a contour or an edge nearby.
+
+        Args:
+            iterations: how the state was reached.
+            profiles: along the unknowns.
+        """
+        return self.fit_of_drives.fit(state, self.at_guess(state), iterations, profiles)
+
     def joint(self) -> JointProblem:
         """The graph's part of the problem."""
         return JointProblem(self.drives, self.tracks, self.config.joint)
@@ -117,6 +138,27 @@ class CalibrationProblem:
         starts = [State(cTl, (time_offset_s,) * clocks) for cTl, time_offset_s in selection.starts]
         centred = [(start, self.prior_centre(start)) for start in starts]
         return solve_all(self.joint(), centred, kernels_px, self.progress)
+
+
+@dataclass(frozen=True)
+class MatchedDrives:
+    """What an estimate was matched with: how other calibrations fit the same can be measured.
+
+    Attributes:
+        problem: drives with the boundary points that were matched.
+        state: the estimate, with the mask biases.
+    """
+
+    problem: CalibrationProblem
+    state: State
+
+    def started_at(self, guess: Guess) -> MatchedDrives:
+        """The same beside another start."""
+        return replace(self, problem=replace(self.problem, guess=guess))
+
+    def fit_at(self, cTl: gtsam.Pose3, time_offset_s: float) -> Fit | None:
+        """The fit of a calibration with one time offset, under the same mask biases."""
+        return self.problem.fit_at(replace(self.state, cTl=cTl, time_offsets_s=(time_offset_s,)))
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from sst_graph.cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_READER_GONE
 from sst_graph.cli.messages import StreamError, complain, flush, loudness
 from sst_graph.cli.options import build_parser
-from sst_graph.errors import SstGraphError, printable
+from sst_graph.errors import ConfigError, SstGraphError, printable
 
 _LOG = logging.getLogger(__name__)
 _LONGEST = 390
@@ -65,6 +65,9 @@ def _unexpected(error: Exception) -> str:
 
 
 def _run(argv: Sequence[str], own_process: bool) -> int:
+    for argument in argv:
+        if "\0" in argument:
+            raise ConfigError(f"argument {argument!r:.60}: found a NUL character, expected none")
     args = build_parser().parse_args(argv)
     loudness.quiet, loudness.lines = args.quiet, own_process
     _set_up_logging(args.verbose)

@@ -80,7 +80,7 @@ def refuse_rig_options(args: argparse.Namespace) -> None:
 
 def run_rig(args: argparse.Namespace, cameras: Sequence[str]) -> int:
     """Calibrate the cameras of ``args.data`` together, print the summaries, write a folder for each."""
-    config = calibration_settings(args)
+    config = dataclasses.replace(calibration_settings(args), for_report=not args.no_report)
     folders = folder_names(tuple(cameras))
     paths = [] if args.video is None else [video_of(args.video, folders[name]) for name in cameras]
     _check_apart(args, paths)

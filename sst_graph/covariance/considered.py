@@ -140,7 +140,8 @@ def columns_of(
         at = state.cTl, state.time_offset_s(pair.drive), c_twist
         for matches in pair.matches.values():
             found = residual_columns(matches.alignment, pair.scene, pair.pair.base_tau_s, at, names)
-            blocks.append(np.stack([found[name] for name in names], axis=1))
+            rows = np.array(list(found.values())).reshape(len(names), len(matches.alignment))
+            blocks.append(rows.T)
     return np.concatenate(blocks)
 
 

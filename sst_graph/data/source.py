@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Literal, TypedDict, Unpack, get_args
 
 from sst_graph.errors import ConfigError, DataError
+from sst_graph.factors.arguments import described, is_whole
+from sst_graph.files.reading import path_of
 from sst_graph.files.typed_values import wrong_fields
 from sst_graph.sweep_timing import SweepStamp
 from sst_graph.types import Source
@@ -26,6 +28,8 @@ LABEL_ENCODINGS: tuple[LabelEncoding, ...] = get_args(LabelEncoding)
 _CHOSEN = ("label_encoding", "sweep", "sweep_stamp", "stamps")
 _EXPECTED = {"frames": "A:B, or a slice", "image_shift": "a whole number", "sweep_start_deg": "a number"}
 """What an option is, where it is no text."""
+_MOST_FRAMES = 2**62
+"""Numbers of frames are below."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +79,12 @@ class SourceOptions:
             if name not in _CHOSEN:
                 found = f"{name.replace('_', ' ')} {getattr(self, name)!r:.60}"
                 raise ConfigError(f"{found}: expected {_EXPECTED.get(name, 'a text')}")
+        for name, value in vars(self).items():
+            if isinstance(value, str) and "\0" in value:
+                found = f"{name.replace('_', ' ')} {value!r:.60}"
+                raise ConfigError(f"{found}: found a NUL character, expected none")
+        if abs(self.image_shift) >= _MOST_FRAMES:
+            raise ConfigError(f"image shift {described(self.image_shift)}: expected a number of frames")
         if self.label_encoding not in LABEL_ENCODINGS:
             raise ConfigError(f"label encoding {self.label_encoding!r}: expected one of {LABEL_ENCODINGS}")
         if self.sweep not in SWEEPS:
@@ -214,8 +224,12 @@ def open_source(
         DataError: nothing there, or data that cannot be used.
         ConfigError: an option that is unknown or out of range.
     """
+    unknown = [name for name in options if name not in ReadOptions.__annotations__]
+    if unknown:
+        known = ", ".join(("loader", "frames", *ReadOptions.__annotations__))
+        raise ConfigError(f"option {unknown[0]!r:.60}: expected one of {known}")
     chosen = SourceOptions(frames=parse_frames(frames) if isinstance(frames, str) else frames, **options)
-    path = Path(path)
+    path = path_of(path, "a drive")
     if loader != "auto":
         return find_loader(loader).opened(path, chosen)
     try:
@@ -239,13 +253,16 @@ def parse_frames(text: str) -> slice:
     Raises:
         ConfigError: the text is no such range.
     """
-    first, colon, last = text.partition(":")
-    if not colon or not all(part.strip().isdecimal() or not part.strip() for part in (first, last)):
-        raise ConfigError(f"frames {text!r}: expected A:B with numbers from 0, as in 10:50")
-    return slice(int(first) if first.strip() else None, int(last) if last.strip() else None)
+    first, colon, last = (part.strip() for part in text.partition(":"))
+    if not colon or not all(not part or (part.isdecimal() and len(part) < 20) for part in (first, last)):
+        raise ConfigError(f"frames {text!r:.60}: expected A:B with numbers from 0, as in 10:50")
+    return slice(int(first) if first else None, int(last) if last else None)
 
 
 def _check_frames(frames: slice) -> None:
+    for each in (frames.start, frames.stop, frames.step):
+        if each is not None and not (is_whole(each) and abs(each) < _MOST_FRAMES):
+            raise ConfigError(f"frames from or to {described(each)}: expected A:B with whole numbers from 0")
     first, last = frames.start or 0, frames.stop
     if frames.step not in (None, 1):
         raise ConfigError(f"frames with step {frames.step}: expected consecutive ones")

@@ -24,7 +24,7 @@ def preflight(
         guess: where the calibration starts, or None.
         classes: that are aligned; empty where labels are not used.
     """
-    found = [units.start_unit(guess)]
+    found = [units.start_unit(guess), repeats.shared_scans(drives)]
     for drive in drives:
         found += [cameras.image_size(drive.camera), clocks.stamps(drive), clocks.two_clocks(drive)]
         found.append(repeats.repeats(drive))

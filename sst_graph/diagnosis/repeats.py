@@ -1,9 +1,10 @@
-"""Sensors that deliver one frame again and again, and clouds that hold the points of earlier scans."""
+"""Sensors that deliver one frame again and again, clouds that hold the points of earlier scans, drives that
+hold scans of one another."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 
@@ -52,6 +53,24 @@ def repeats(drive: Drive) -> Finding | None:
                 f"look at {check}, and leave those frames out",
             )
     return _earlier_points(drive)
+
+
+def shared_scans(drives: Sequence[Drive]) -> Finding | None:
+    """Drives that hold the same scans to the last bit: what is counted twice makes the sigmas too small."""
+    scans = [
+        {(scan.digest, scan.sample.tobytes()) for scan in drive.statistics.scans if scan.digest}
+        if drive.statistics is not None
+        else set()
+        for drive in drives
+    ]
+    for (one, a), (other, b) in combinations(zip(drives, scans, strict=True), 2):
+        if a & b:
+            return Finding(
+                "the same scans are given twice",
+                f"{len(a & b)} scans of {one.name} are in {other.name}, too, to the last bit",
+                "give each frame once: counted twice it makes the sigmas too small",
+            )
+    return None
 
 
 def _earlier_points(drive: Drive) -> Finding | None:

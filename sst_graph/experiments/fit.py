@@ -14,13 +14,13 @@ from dataclasses import dataclass, field, replace
 import gtsam
 import numpy as np
 
-from sst_graph.batch.by_edges.reasons import turned_states
 from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import Progress
+from sst_graph.edges.turns import turned_states
 from sst_graph.fit import FitQuality
 from sst_graph.graph.outer_loop import NARROW_KERNELS_PX, solve_joint
 from sst_graph.graph.state import State

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from sst_graph.errors import DataError
+from sst_graph.factors.arguments import described
 
 MAX_DEPTH = 64
 """Levels of JSON or TOML; what this package writes has at most ten."""
@@ -57,6 +58,20 @@ CALIB_TXT = FileKind("a KITTI calib.txt", 1024 * 1024)
 TIMES_TXT = FileKind("a text file with one number of seconds a line", 32 * 1024 * 1024)
 
 
+def path_of(value: str | Path, expected: str) -> Path:
+    """A path that a caller gave.
+
+    Raises:
+        DataError: a value that is no path; ``expected`` says what should be there.
+    """
+    if not isinstance(value, str | os.PathLike):
+        raise DataError("path", described(value), f"a text or a pathlib.Path, of {expected}")
+    path = Path(value)
+    if "\0" in str(path):
+        raise DataError(path, "no name of a file (a NUL character is in it)", expected)
+    return path
+
+
 def read_file(path: str | Path, kind: FileKind) -> bytes:
     """Contents of a regular file of at most ``kind.max_bytes``.
 
@@ -87,6 +102,7 @@ def digest_of_file(path: str | Path, kind: FileKind) -> bytes:
 @contextmanager
 def _opened(path: str | Path, kind: FileKind) -> Iterator[BufferedReader]:
     """A regular file of at most ``kind.max_bytes``, open to be read; errors, also of reading it, are ours."""
+    path = path_of(path, kind.name)
     try:
         _require_regular(os.stat(path), path, kind)
         # O_NONBLOCK: what was replaced by a FIFO since must not block either
@@ -98,7 +114,7 @@ def _opened(path: str | Path, kind: FileKind) -> Iterator[BufferedReader]:
         raise DataError(path, "no such file", kind.name) from None
     except OSError as error:
         raise DataError(path, f"an unreadable file ({error.strerror or error})", kind.name) from None
-    except ValueError as error:  # a NUL or a lone surrogate in the name
+    except ValueError as error:  # a lone surrogate in the name
         raise DataError(path, f"no name of a file ({error})", kind.name) from None
 
 

@@ -112,6 +112,8 @@ def real_path(path: str | Path) -> Path:
 def _check_reachable(path: str | Path, target: Path) -> None:
     """Refuse a target whose folder cannot be made or written, or that is too long a name."""
     folder = target.parent
+    if os.path.islink(target):  # though links are resolved: it leads to itself
+        raise ConfigError(f"{path}: found a loop of symbolic links, expected a name")
     try:
         os.lstat(target)
     except (FileNotFoundError, NotADirectoryError):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from sst_graph.drive.path import SensorPath
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import EstimationError
+from sst_graph.fit import OuterIteration
 from sst_graph.graph.convergence import STEP_SIGMAS, step_share
 from sst_graph.graph.state import EXTRINSIC, State, difference, time_offset_key
 from sst_graph.hand_eye.covariance import hand_eye_covariance
@@ -64,8 +65,9 @@ class MotionSolution:
         scales: that noise, in multiples of what odometry states.
         covariance: (7, 7).
         cost: log of the noise that the residuals have, over all pairs: a negative log-likelihood.
-        outer_iterations: done.
+        outer_iterations: done since the outer loop last began.
         converged: the last step was short.
+        iterations: all of them, from the start on.
     """
 
     state: State
@@ -76,6 +78,7 @@ class MotionSolution:
     cost: float
     outer_iterations: int
     converged: bool
+    iterations: tuple[OuterIteration, ...] = ()
 
 
 def solve_motion(
@@ -136,7 +139,8 @@ def _finished(
     """A solution with its outer loop run to the end."""
     if solution.converged:
         return solution
-    return _solve(steps, paths, solution.state, solution.centre) or solution
+    again = _solve(steps, paths, solution.state, solution.centre)
+    return solution if again is None else replace(again, iterations=solution.iterations + again.iterations)
 
 
 def _apart(a: MotionSolution, b: MotionSolution) -> float:
@@ -157,6 +161,7 @@ def _solve(
     None where the offset runs away to where too few pairs are left.
     """
     converged, outer = False, 0
+    iterations = []
     while outer < max_outer and not converged:
         outer += 1
         # 1. The LiDAR's motion at the current offset, under the noise that the residuals have.
@@ -173,9 +178,11 @@ def _solve(
         # alternate; stop when the step is small.
         step = step_share(outer) * difference(state, moved)
         state = state.moved(step)
+        iterations.append(OuterIteration(None, len(pairs), state.cTl, state.time_offsets_s[0]))
         converged = float(step @ np.linalg.solve(covariance, step)) < STEP_SIGMAS**2
     misfit = len(terms) * (3.0 * np.log(scales.rotation) + 2.0 * np.log(scales.direction))
-    return MotionSolution(state, centre, terms, scales, covariance, float(misfit), outer, converged)
+    cost = float(misfit)
+    return MotionSolution(state, centre, terms, scales, covariance, cost, outer, converged, tuple(iterations))
 
 
 def _optimise(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.fit import CLOSE_PX, FitQuality
+from sst_graph.fit import CLOSE_PX, EDGES_QUALITY, FitQuality
 from sst_graph.inspect.pixels import cP_H_cTl, pixel_covariance
 from sst_graph.inspect.reasons import as_sentence, short_reasons
 from sst_graph.result import CalibrationResult
@@ -22,6 +22,8 @@ _PLACES = 3
 """Places across and down the picture, its borders among them, at which the error is evaluated."""
 DRIVING_MPS = 10.0
 """Speed, straight ahead, for which the error is given besides that at rest [m/s]."""
+
+CHECK_BY_EDGES = "a check by edges of the pictures, which the estimate has not used"
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,11 @@ def fit_line(result: CalibrationResult) -> str:
     quality = FitQuality.from_diagnostics(result.diagnostics)
     if quality is None:
         return edges_line(result)
+    of_edges = FitQuality.from_diagnostics(result.diagnostics, EDGES_QUALITY)
+    if of_edges is not None:
+        return f"labels: {quality_line(quality)}; edges in frames without labels: {quality_line(of_edges)}"
+    if result.fit_is_check:
+        return f"{CHECK_BY_EDGES}: {quality_line(quality)}"
     contrast = "" if quality.by_chance is None else edges_line(result)
     return "; ".join(line for line in (contrast, quality_line(quality)) if line)
 

@@ -9,17 +9,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.drive.preparation import Drive
+from sst_graph.edges.turns import turned_states
 from sst_graph.fit import CLOSE_PX, MOST_POINTS, Fit, FitQuality, OuterIteration, Profile
 from sst_graph.graph.matching import GraphConfig, Tracks, edges_of
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import ObjectId
 from sst_graph.quality.close_points import attainable_share, close_share
 from sst_graph.quality.residuals import Measured, measure_points
+from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
 
 _POINTS_OF_SHARE = 10_000
 """Most points of a drive whose share is measured under other states."""
+_TURNED = 3
+"""Random rotations under which the share of close points is measured: it differs by a percentage point among
+them."""
 
 
 class FitOfDrives:
@@ -31,14 +36,17 @@ class FitOfDrives:
         tracks: Tracks,
         objects: Sequence[dict[ObjectId, int]],
         config: GraphConfig,
+        seed: int = 0,
     ) -> None:
         """
         Args:
             objects: tracks of the objects of each drive.
             config: where no mask has a class, points are compared with the strongest edge nearby: matches
                 of an estimate follow the pose.
+            seed: of the random rotations that edges of pictures are compared under.
         """
-        self.objects = objects
+        self.objects, self.seed = objects, seed
+        self.by_edges = has_edges(drives)
         self.edges = edges_of(drives, tracks, replace(config, edge_place="strongest"))
 
     def measured(self, state: State) -> Measured | None:
@@ -81,18 +89,18 @@ class FitOfDrives:
         start: State | None,
         iterations: Sequence[OuterIteration],
         profiles: Sequence[Profile],
-        others: Sequence[State] = (),
     ) -> Fit | None:
         """Of a state; None where no boundary point has a contour or an edge.
 
         Args:
-            start, others: as :meth:`quality` has them.
+            start: as :meth:`quality` has it.
             iterations: how the state was reached.
             profiles: along the unknowns.
         """
         measured = self.measured(state)
         if measured is None:
             return None
+        others = turned_states(state, self.seed)[:_TURNED] if self.by_edges else ()
         quality, points = self.quality(measured, start, others), measured.points
         every = -(-len(points) // MOST_POINTS)
         return Fit(
@@ -110,6 +118,11 @@ class FitOfDrives:
             return 0.0
         close = there.keys[np.abs(there.points.residuals_px) < CLOSE_PX]
         return len(_rows(close) & _rows(measured.keys)) / len(measured.keys)
+
+
+def has_edges(drives: Sequence[Drive]) -> bool:
+    """Whether objects without a class are compared with edges of the pictures."""
+    return any(SemanticClass.OBJECT in image.contours for drive in drives for image in drive.images)
 
 
 def _rows(keys: NDArray[np.intp]) -> set[tuple[int, int]]:

@@ -168,7 +168,12 @@ def _close_up(
     range_m = float(np.median(np.linalg.norm(points.lPs, axis=1)))
     by_edges = not _has_contours(points)
     worst = "edges agree least" if by_edges else "labels agree least"
-    title = f"{class_name} at {range_m:.0f} m, {worst if detection.worst else 'determines most'}"
+    telling = "tells most" if result.fit_is_check else "determines most"
+    title = f"{class_name} at {range_m:.0f} m, {worst if detection.worst else telling}"
+    of_kind = f" of the {'edges' if by_edges else 'labels'}" if len(result.fits) > 1 else ""
+    information = f"{100.0 * detection.share:.1f} % of the information{of_kind}. "
+    if result.fit_is_check:
+        information = ""
     sides = ", ".join(
         f"{_SIDE_NAMES[side]} {_mean(points, points.sides == side):+.1f} px"
         for side in np.unique(points.sides)
@@ -177,7 +182,7 @@ def _close_up(
     caption = (
         f"{size:.1f} px from the {'edges' if by_edges else 'contour'} (median of {len(r)} points; {sides}), "
         f"{100.0 * np.mean(np.abs(r) < CLOSE_PX):.0f} % within {CLOSE_PX:g} px. ±2 sigma of the calibration "
-        f"moves it by ±{reach:.1f} px. {100.0 * detection.share:.1f} % of the information. "
+        f"moves it by ±{reach:.1f} px. {information}"
         f"{drawn.frame.drive}, image {drawn.frame.image}, about column {column}, row {row}."
     )
     width, height = picture.shape[1], picture.shape[0]

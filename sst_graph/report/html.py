@@ -15,7 +15,12 @@ _JPEG_QUALITY = 82
 
 def text(words: str) -> str:
     """Words as text of a page, or of an attribute in double quotes."""
-    return html.escape(words.encode("utf-8", "backslashreplace").decode("utf-8"), quote=True)
+    return html.escape(printable(words), quote=True)
+
+
+def printable(words: str) -> str:
+    """Words that a file can hold: names of files may have bytes that are no text."""
+    return words.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def section(name: str, title: str, *blocks: str) -> str:

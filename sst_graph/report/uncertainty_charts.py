@@ -45,7 +45,7 @@ def convergence_chart(fit: Fit, result: CalibrationResult) -> str:
     chart = Chart(
         (1, len(iterations)),
         (np.log10(_LEAST_SIGMAS), top),
-        ("outer iteration", "distance to the result, log10 of sigmas"),
+        ("outer iteration", "distance, log10 of sigmas"),
         "Distance to the result in each outer iteration",
     )
     chart.level(0.0, "one sigma")
@@ -54,8 +54,10 @@ def convergence_chart(fit: Fit, result: CalibrationResult) -> str:
     return figure(
         chart.svg(),
         "Convergence",
-        "Each iteration matches again and solves. The curves should fall below one sigma and stay there."
-        + " The first ones are on a few scans, the last on all." * fit.by_edges,
+        f"Each iteration {'pairs motions' if result.fit_is_check else 'matches'} again and solves. "
+        "The curves should fall below one sigma and stay there."
+        + " The first ones are on a few scans, the last on all."
+        * (fit.by_edges and not result.fit_is_check),
     )
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sst_graph.batch.by_edges.choice import with_method_for_cameras, with_method_of
 from sst_graph.batch.by_edges.method import edges_method
+from sst_graph.batch.by_edges.problem import with_fewer_points
 from sst_graph.batch.calibrate import (
     finished,
     preparation_of,
@@ -20,7 +21,7 @@ from sst_graph.batch.calibrate import (
     solve_problem,
 )
 from sst_graph.batch.config import CalibrationConfig, prepared_classes
-from sst_graph.batch.method_estimate import UNKNOWN_SIGMAS, MethodEstimate
+from sst_graph.batch.method_estimate import UNKNOWN_SIGMAS, MethodEstimate, quality_of
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.batch.sources import as_sources
 from sst_graph.config import expect_settings, to_dict
@@ -30,8 +31,10 @@ from sst_graph.drive.further_camera import with_camera
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.factors.arguments import checked_type
-from sst_graph.fit import QUALITY
+from sst_graph.fit import QUALITY, Fit
 from sst_graph.graph.outer_loop import KERNELS_PX
+from sst_graph.graph.state import State
+from sst_graph.quality.fit_of_solution import has_edges
 from sst_graph.result import CalibrationResult, Status
 from sst_graph.rig.adjustment import (
     ComparedPose,
@@ -80,6 +83,8 @@ def calibrate_rig(
     """
     known = KnownRig() if known is None else known
     checked_type("cameras", cameras, Mapping, "a dict of sources by the camera's name")
+    for name in cameras:
+        checked_type("name of a camera", name, str, "a text")
     checked_type("known", known, KnownRig, "a KnownRig, or None")
     sources = {name: as_sources(own) for name, own in cameras.items()}
     guesses = _guesses(list(sources), initial or {}, initial_time_offsets_s or {})
@@ -117,9 +122,10 @@ def calibrate_rig_prepared(
     Args:
         guesses: of every camera.
     """
-    config = replace(
-        with_method_of(config, [drive for own in drives.values() for drive in own]), profiles=False
-    )
+    config = with_method_of(config, [drive for own in drives.values() for drive in own])
+    # Likelihoods are of a camera's own estimate, which is not the result where something is known.
+    nothing_known = not known.poses and not known.one_trigger
+    config = replace(config, for_report=config.for_report and nothing_known)
     # 1. Each camera by itself, on the same LiDAR features, odometry and object tracks.
     problems = _problems(drives, guesses, config, progress)
     cameras = {name: _solved(problem) for name, problem in problems.items()}
@@ -218,6 +224,17 @@ class _Camera:
             return float(self.errors.estimated) if isinstance(self.errors, SharedErrors) else 1.0
         return outcome.estimate.robust.table.clusters
 
+    def fit_at(self, cTl: gtsam.Pose3, time_offset_s: float) -> Fit | None:
+        """How a calibration fits its labels or edges: its own estimate, or one that the rig has moved."""
+        own = self.result
+        if own.fit is not None and own.time_offset_s == time_offset_s and own.T_camera_lidar.equals(cTl, 0.0):
+            return own.fit
+        if self.estimate is not None and self.estimate.matched is not None:
+            return self.estimate.matched.fit_at(cTl, time_offset_s)
+        by_edges = has_edges(self.problem.drives)
+        problem = with_fewer_points(self.problem) if by_edges else self.problem
+        return problem.fit_at(State(cTl, (time_offset_s,)))
+
 
 def _solved(problem: CalibrationProblem, start: Guess | None = None) -> _Camera:
     """A camera's own estimate, searched around its guess, or close around another start."""
@@ -232,6 +249,9 @@ def _solved(problem: CalibrationProblem, start: Guess | None = None) -> _Camera:
         config = {**result.config, "search": to_dict(problem.config.search)}
         guess = problem.guess
         result = replace(result, initial=guess.cTl, initial_time_offset_s=guess.time_offset_s, config=config)
+        result = replace(result, fit=None)  # beside another start
+        if estimate is not None and estimate.matched is not None:
+            estimate = replace(estimate, matched=estimate.matched.started_at(guess))
     return _Camera(problem, result, estimate)
 
 
@@ -438,6 +458,7 @@ def _camera_result(
         "covariance": own.covariance.tolist(),
         "status": own.status,
     }
+    fit = camera.fit_at(cTl, after.time_offsets_s[at])
     diagnostics = {key: value for key, value in own.diagnostics.items() if key != QUALITY}
     return replace(
         own,
@@ -448,6 +469,6 @@ def _camera_result(
         camera_name=name,
         reasons=(*wrong, *kept, *sentences),
         weak_directions=weak,
-        diagnostics={**diagnostics, "by_own_images": alone},
-        fit=None,  # of the estimate by its own images
+        diagnostics={**diagnostics, **quality_of(fit), "by_own_images": alone},
+        fit=fit,
     )

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.files.checked_values import check_covariance, check_finite
 from sst_graph.files.json_table import JsonTable, json_table
-from sst_graph.files.reading import FileKind, parse_json, read_text
+from sst_graph.files.reading import FileKind, parse_json, path_of, read_text
 from sst_graph.files.strict_json import strict_json
 from sst_graph.result import CALIBRATION_NAME, RIG_NAME, CalibrationResult, Status, read_result
 from sst_graph.rig.known import KnownPose, KnownRig
@@ -161,7 +161,7 @@ def read_rig(path: str | Path) -> RigResult:
     Raises:
         DataError: a file is missing, unreadable, or of another result.
     """
-    path = Path(path)
+    path = path_of(path, "a rig.json")
     file = path / RIG_NAME if path.is_dir() else path
     text = read_text(file, RIG)
     names = _names(json_table(parse_json(text, file, RIG.name), file, FORMAT, VERSION))

@@ -1,7 +1,6 @@
 """Plots of an inspection: ellipses, correlations, sigma over frames, gain by frame, what next, the graph.
 
-Needs matplotlib (the extra ``plot``), imported when a plot is made; pyplot and its global state are
-left alone.
+matplotlib is imported when a plot is made; pyplot and its global state are left alone.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ def figure_class(otherwise: str = "") -> Any:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise MissingDependencyError(
-            f"plots need matplotlib, which is not installed: pip install 'sst-graph[plot]'{otherwise}"
+            f"plots need matplotlib, which is not installed: pip install matplotlib{otherwise}"
         ) from error
     except Exception as error:
         raise ConfigError(f"matplotlib does not start (MPLBACKEND, matplotlibrc?): {error}") from error

@@ -89,6 +89,15 @@ def test_a_distorted_picture_is_named_and_can_be_estimated(k1: float) -> None:
     assert rotation_deg < 0.1 and translation_m < 0.015
 
 
+def test_with_every_parameter_estimated_nothing_is_left_to_consider() -> None:
+    assumptions = AssumptionConfig(estimate=tuple(ASSUMPTIONS), test=False)
+    drive = prepared()[0]
+    few = dataclasses.replace(drive, scans=drive.scans[:3], lidar_motions=drive.lidar_motions[:2])
+    result = calibrated([few], dataclasses.replace(CONFIG, assumptions=assumptions))
+    assert set(result.diagnostics["estimated"]) <= set(ASSUMPTIONS) and result.frames_used
+    assert not set(result.diagnostics[BUDGET]) & set(ASSUMPTIONS)
+
+
 @pytest.mark.slow
 def test_a_slight_distortion_is_covered_or_named() -> None:
     result = calibrated(prepared(-0.03))

@@ -162,7 +162,7 @@ def test_without_matplotlib(
     capsys.readouterr()
     assert main(["inspect", path, "--plots", str(tmp_path / "plots")]) == 2
     captured = capsys.readouterr()
-    assert "pip install 'sst-graph[plot]'" in captured.err and captured.err.count("\n") == 1
+    assert "pip install matplotlib" in captured.err and captured.err.count("\n") == 1
     assert captured.out == "" and not (tmp_path / "plots").exists()
 
 

@@ -75,6 +75,12 @@ def test_usage_errors_are_one_line(
     assert "--help" in captured.err
 
 
+def test_a_nul_in_an_argument_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments in (["calibrate", "a\0", "--out", "b"], ["export", "a", "--to", "kitti", "--out", "b\0"]):
+        assert main(arguments) == 2
+        assert "found a NUL character" in capsys.readouterr().err
+
+
 def test_bad_input_from_the_shell(tmp_path: Path) -> None:
     done = _run("evaluate", str(tmp_path / "none.json"), "--truth", str(tmp_path / "truth.json"))
     assert done.returncode == 2 and done.stdout == ""

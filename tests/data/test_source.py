@@ -13,8 +13,10 @@ import gtsam
 import numpy as np
 import pytest
 
+from sst_graph import Tracker, read_result, read_rig
 from sst_graph.data import KittiSource, open_source
 from sst_graph.errors import ConfigError, DataError
+from sst_graph.marginal import read_marginal
 from sst_graph.types import CameraImage, Frame, Scan, SemanticClass, Source, intensities_of
 
 FRAMES, POINTS, WIDTH, HEIGHT = 5, 12, 8, 6
@@ -179,6 +181,30 @@ def test_one_of_several_sequences_must_be_named(drive: Path) -> None:
 )
 def test_frames_are_scan_indices(drive: Path, frames: str | slice, indices: list[int]) -> None:
     assert [frame.index for frame in open_source(drive, frames=frames)] == indices
+
+
+@pytest.mark.parametrize(
+    ("options", "found"),
+    [
+        ({"frames": slice(0, 10**5000)}, "more than 40 digits"),
+        ({"frames": slice("a", 5)}, "the text 'a'"),
+        ({"frames": slice(0.5, 5)}, "0.5"),
+        ({"frames": "0:" + "9" * 5000}, "frames '0:999"),
+        ({"image_shift": 10**5000}, "more than 40 digits"),
+        ({"cloud": "a\0"}, "a NUL character"),
+        ({"colour": 1}, "option 'colour'"),
+    ],
+)
+def test_an_option_is_refused_by_its_name(drive: Path, options: dict[str, Any], found: str) -> None:
+    with pytest.raises(ConfigError, match=found):
+        open_source(drive, **options)
+
+
+@pytest.mark.parametrize("path", [7, None, b"street", "a\0"])
+def test_what_is_no_path_is_refused(path: Any) -> None:
+    for read in (open_source, read_result, read_rig, read_marginal, Tracker.load):
+        with pytest.raises(DataError, match=r"path: found|a NUL character"):
+            read(path)
 
 
 def test_slices_are_drives(drive: Path) -> None:

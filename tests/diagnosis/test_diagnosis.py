@@ -109,6 +109,15 @@ def test_a_doubled_picture_now_and_then_is_left_to_the_robust_matching() -> None
     assert causes(repeated_pictures(drive(), every=5)) == []
 
 
+def test_scans_that_are_given_twice_make_no_result_surer() -> None:
+    for end, count in ((5, 0), (6, 1)):
+        given = [replace(drive(), frames=drive().frames[part]) for part in (slice(0, end), slice(5, 10))]
+        drives = prepare_drives(given, CalibrationConfig())
+        found = [finding.evidence for finding in preflight(drives, drive().nominal, CLASSES)]
+        assert len(found) == count
+        assert all(sentence.startswith("1 scans of") for sentence in found)
+
+
 def test_frames_without_content_are_no_repeated_ones() -> None:
     """Missing pictures are all alike, and so are scans without points; no sensor is frozen."""
     none = np.uint8(SemanticClass.IGNORE)

@@ -6,7 +6,13 @@ import gtsam
 import numpy as np
 import pytest
 
-from sst_graph.factors.arguments import checked_array, checked_covariance, checked_positive, described
+from sst_graph.factors.arguments import (
+    checked_array,
+    checked_covariance,
+    checked_positive,
+    checked_rows,
+    described,
+)
 from sst_graph.factors.errors import FactorError, SstGraphError, printable
 
 
@@ -52,6 +58,15 @@ def test_an_array_is_a_read_only_copy_of_its_shape() -> None:
     for wrong in (np.ones((2, 2)), np.ones(3), "abc", [[1.0, None, 2.0]], [[1.0, np.inf, 0.0]]):
         with pytest.raises(FactorError):
             checked_array("x", wrong, (None, 3))  # type: ignore[arg-type]
+
+
+def test_a_mask_is_not_read_through() -> None:
+    hidden = np.ma.masked_array(np.ones((2, 3)), mask=[[False, True, False], [True, False, False]])
+    with pytest.raises(FactorError, match="found 2 masked values"):
+        checked_array("x", hidden, (None, 3))
+    with pytest.raises(FactorError, match="found 2 masked values"):
+        checked_rows("x", hidden, 3)
+    assert type(checked_rows("x", np.ma.masked_array(np.ones((2, 3))), 3)) is np.ndarray
 
 
 @pytest.mark.parametrize("value", [1e-300, 1, np.float32(2.0), np.int64(3)])

@@ -10,6 +10,12 @@ from sst_graph.factors import MIN_DEPTH_M, PinholeCamera
 CAMERA = PinholeCamera(700.0, 710.0, 600.0, 180.0, 1242, 375)
 
 
+def test_numbers_of_numpy_are_kept_as_plain_ones():
+    camera = PinholeCamera(np.float16(700.0), np.array(710.0), 600, 180.0, np.int16(1242), np.uint16(375))
+    assert camera == PinholeCamera(700.0, 710.0, 600.0, 180.0, 1242, 375) and hash(camera) == hash(CAMERA)
+    assert [type(value) for value in vars(camera).values()] == 4 * [float] + 2 * [int]
+
+
 def test_projects_as_gtsam_does():
     cPs = np.random.default_rng(0).uniform([-5, -2, 3], [5, 2, 40], (100, 3))
     oracle = gtsam.PinholeCameraCal3_S2(gtsam.Pose3(), gtsam.Cal3_S2(700.0, 710.0, 0.0, 600.0, 180.0))

@@ -396,6 +396,16 @@ def test_a_place_that_cannot_be_written_is_refused(tmp_path: Path, name: str) ->
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_link_that_leads_to_itself_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    with pytest.raises(ConfigError, match="a loop of symbolic links"):
+        check_folder_target(tmp_path / "a", True, KIND)
+    with pytest.raises(ConfigError, match="a loop of symbolic links"), output_file(tmp_path / "a", False):
+        pytest.fail("the block must not run")
+    assert (tmp_path / "a").is_symlink()
+
+
 def test_long_and_strange_names_are_fine(tmp_path: Path) -> None:
     for name in ("n" * 255, os.fsdecode(b"stra\xdfe"), "a b\nc", ".hidden", "*[a]?"):
         for text in ("old", "new"):

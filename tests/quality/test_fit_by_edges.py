@@ -85,7 +85,7 @@ def test_the_gaussian_of_a_profile_is_the_nearest_to_its_costs() -> None:
 
 
 def test_profiles_are_left_out_where_no_report_is_wanted() -> None:
-    fit = fit_at(np.zeros(7), replace(CONFIG, profiles=False))
+    fit = fit_at(np.zeros(7), replace(CONFIG, for_report=False))
     assert fit.profiles == () and fit.quality == fit_by_edges().quality
 
 

@@ -135,6 +135,20 @@ def test_nothing_is_loaded_from_elsewhere(by: str) -> None:
     assert not re.search(r"https?:|@import|url\(|fetch\(|XMLHttp|WebSocket", PAGES[by]())
 
 
+@pytest.mark.parametrize("by", PAGES)
+def test_charts_have_no_ids_and_take_their_colours_from_the_page(by: str) -> None:
+    page = PAGES[by]()
+    charts = re.findall(r'<svg class="chart".*?</figure>', page, re.DOTALL)
+    assert len(charts) == 17
+    style = page[page.index("<style>") : page.index("</style>")]
+    for chart in charts:
+        assert not re.search(r" id=|href=|xmlns|<style|<defs|<metadata|#[0-9a-f]{6}|rgb\(|font", chart)
+        used = set(re.findall(r"(?:fill|stroke): ([^;\"]+)", chart))
+        assert used - {"none"} == {one for one in used if re.fullmatch(r"var\(--[a-z]+\)", one)}
+        assert all(f"{one[4:-1]}: #" in style for one in used - {"none"})
+    assert "<?xml" not in page and page.count("<!DOCTYPE") == 1
+
+
 PROBE = (
     "<script>addEventListener('load', () => setTimeout(() => { parent.document.title = JSON.stringify({"
     "wide: document.documentElement.scrollWidth, window: innerWidth, "
@@ -308,12 +322,12 @@ def test_a_wrong_calibration_is_seen_on_the_page() -> None:
     assert _checked(page).headings[3:6] == ["Telling objects", "Residuals", "Likelihood"]
 
     def tops(page: str) -> list[float]:
-        charts = re.findall(r'aria-label="Likelihood along.*?</svg></svg>', page, re.DOTALL)
+        charts = re.findall(r'aria-label="Likelihood along.*?</figure>', page, re.DOTALL)
         assert len(charts) == 7
         found = []
         for chart in charts:
-            (line,) = re.findall(r'class="line a" points="([^"]*)"', chart)
-            points = _numbers(r"([-\d.]+),([-\d.]+)", line)
+            (line,) = re.findall(r'class="line a".*? d="([^"]*)"', chart, re.DOTALL)
+            points = _numbers(r"[ML] ([-\d.]+) ([-\d.]+)", line)
             middle = 0.5 * (points[0, 0] + points[-1, 0])
             found.append(6.0 * (points[points[:, 1].argmin(), 0] - middle) / np.ptp(points[:, 0]))
         return found

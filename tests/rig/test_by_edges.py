@@ -50,6 +50,9 @@ def test_two_cameras_without_labels() -> None:
         assert one.method == "edges"
         assert error @ np.linalg.solve(one.covariance, error) < 2.0 * 7.0
         assert np.degrees(np.linalg.norm(error[:3])) < 0.3
+        fit = one.fit
+        assert fit is not None and fit.by_edges and len(fit.profiles) == 7
+        assert fit.quality.by_chance is not None and fit.quality.share > 1.5 * fit.quality.by_chance
     sigmas = np.sqrt(np.diag(alone.covariance))
     shared = np.diag(alone.covariance[:7, 7:]) / (sigmas[:7] * sigmas[7:])
     assert (shared[:3] > 0.5).all()
@@ -61,6 +64,11 @@ def test_two_cameras_without_labels() -> None:
     known = KnownRig((KnownPose("right", "left", stereo_pose()),), one_trigger=True)
     together = calibrate_rig_prepared(drives, guesses, config, known)
     assert together.status == "ok" and together.diagnostics["known_poses"][0]["used"]
+    for name, one in together.cameras.items():
+        fit, own = one.fit, alone[name].fit
+        assert fit is not None and fit.by_edges and fit.profiles == fit.iterations == () and own is not None
+        assert fit.quality.share == pytest.approx(own.quality.share, abs=0.03)
+        assert fit.quality.share_at_start == pytest.approx(own.quality.share_at_start, abs=0.01)
     after = np.sqrt(np.diag(together.covariance))
     assert (after < 1.01 * np.minimum(np.tile(sigmas[:7], 2), np.tile(sigmas[7:], 2)) + 1e-4).all()
     # Pitch hangs on where upper edges lie between the beams, which both cameras see alike.

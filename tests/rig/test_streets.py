@@ -188,6 +188,7 @@ def test_a_camera_without_masks_has_its_pose_from_the_other() -> None:
     right = result["right"]
     assert result["left"].status == "ok" and right.status == "ok"
     assert right.reasons[0].startswith("its own images give no estimate")
+    assert right.fit is None and result["left"].fit is not None
     assert right.T_camera_lidar.equals(_true_pose() * result["left"].T_camera_lidar, 1e-6)
     unknown = calibrate_rig_prepared(both, guesses, CalibrationConfig(), KnownRig())
     assert unknown["right"].status == "unobservable" and unknown["left"].status == "ok"
@@ -254,6 +255,7 @@ def test_settings_that_a_rig_has_not(overrides: list[str], found: str) -> None:
         ({"cameras": None}, "cameras: found None, expected a dict"),
         ({"cameras": [1, 2]}, "cameras: found a list"),
         ({"cameras": {"left": 7}}, "frames to calibrate"),
+        ({"cameras": {7: None}}, "name of a camera: found 7"),
         ({"initial": gtsam.Pose3()}, "initial: found a Pose3"),
         ({"initial": {"lift": None}}, "initial: found a guess of 'lift', expected of left, right"),
         ({"initial": {"left": 7}}, "initial: found a int"),

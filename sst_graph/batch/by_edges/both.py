@@ -18,6 +18,8 @@ from sst_graph.batch.motion_factor import MAX_DISAGREEMENT_CHI2
 from sst_graph.covariance.undecided_sweep import MATTERS
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import EstimationError
+from sst_graph.fit import Fit
+from sst_graph.graph.state import State
 from sst_graph.inspect.frame_information import KEY as FRAME_INFORMATION
 from sst_graph.types import Guess
 
@@ -63,7 +65,7 @@ def both_method(
     # 3. Labels that found nothing by themselves once more, from there.
     if not _usable(labels) and _usable(edges):
         assert isinstance(edges, MethodEstimate)
-        labels = solve_labels(Guess(edges.cTl, edges.time_offset_s))
+        labels = _started_at(guess, solve_labels(Guess(edges.cTl, edges.time_offset_s)))
     # 4. Both as one.
     return fuse_parts(labels, edges)
 
@@ -74,6 +76,18 @@ def _attempt(run: Callable[[], MethodEstimate]) -> _Part:
         return run()
     except EstimationError as error:
         return str(error)
+
+
+def _started_at(guess: Guess, part: _Part) -> _Part:
+    """A part whose fit is to be measured beside the start of both."""
+    if isinstance(part, str) or part.matched is None:
+        return part
+    return replace(part, matched=part.matched.started_at(guess))
+
+
+def _fit_at(fused: State, part: MethodEstimate) -> Fit | None:
+    """How a part's labels or edges fit the estimate of both."""
+    return None if part.matched is None else part.matched.fit_at(fused.cTl, fused.time_offsets_s[0])
 
 
 def _usable(part: _Part) -> bool:
@@ -149,6 +163,10 @@ def _of_both_parts(labels: MethodEstimate, edges: MethodEstimate) -> MethodEstim
         by_static_objects=static,
         diagnostics={**diagnostics, "edges": dict(edges.diagnostics), "both": facts},
         solved=None,
+        # Of convergence and likelihood each part has its own, about another estimate than this.
+        fit=_fit_at(fused.state, labels),
+        edges_fit=_fit_at(fused.state, edges),
+        matched=None,
     )
 
 

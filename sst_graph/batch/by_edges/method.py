@@ -4,6 +4,7 @@ labels."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from sst_graph.batch.by_edges.reasons import EdgeContrast, edge_contrast, edges_
 from sst_graph.batch.by_edges.solution import WIDER_KERNEL_PX
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import MethodEstimate, frames_used
-from sst_graph.batch.problem import CalibrationProblem, JointEstimate
+from sst_graph.batch.problem import CalibrationProblem, JointEstimate, MatchedDrives
 from sst_graph.batch.total_covariance import sweep_effects
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.graph.outer_loop import JointSolution, solve_joint
@@ -77,7 +78,8 @@ def edges_method(
         reasons += halves_reasons(problem.whole, solution.state, covariance)
     # 6. How it fits the pictures, point by point.
     first = [one for _, one in candidates[:1]]
-    fit = fit_of_edges(calibration, (*first, solution), covariance)
+    matched = replace(calibration, drives=problem.whole.drives)
+    fit = fit_of_edges(matched, (*first, solution), covariance)
     return MethodEstimate(
         solution.state.cTl,
         solution.state.time_offsets_s[0],
@@ -90,6 +92,7 @@ def edges_method(
         | {"spread": {**own.sigmas, "farther_edges": np.abs(wider_step).tolist()}}
         | {"assumptions": dict(own.assumptions), "estimated": dict(own.estimated)},
         fit=fit,
+        matched=MatchedDrives(matched, solution.state),
         by_sweeps=sweeps.covariance,
         sweep_reasons=sweeps.reasons,
         shared=own.shared,

@@ -121,6 +121,11 @@ def motion_alone(
     return possible[0]
 
 
+def with_fewer_points(calibration: CalibrationProblem) -> CalibrationProblem:
+    """The problem with no more boundary points than are matched with edges."""
+    return replace(calibration, drives=[thinned(drive, POINTS_A_SCAN) for drive in calibration.drives])
+
+
 def edges_problem(
     calibration: CalibrationProblem, motion: MotionSolution | None, labels: LabelEstimate
 ) -> EdgesProblem:
@@ -137,8 +142,8 @@ def edges_problem(
             "without labels, a start is needed: a guess within 5 deg (--init), or a drive whose motion "
             "tells the rotation (turns and changes of speed)"
         )
-    drives = [thinned(drive, POINTS_A_SCAN) for drive in calibration.drives]
-    joint = replace(calibration.joint(), drives=drives)
+    joint = with_fewer_points(calibration).joint()
+    drives = joint.drives
     region = _region(guess, motion, _time_offsets(calibration, motion))
     if labels.state is not None:
         region = replace(region, cTl=labels.state.cTl, time_offsets_s=labels.state.time_offsets_s)

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.edges.agreement import score
-from sst_graph.edges.search import angle_deg, turned
+from sst_graph.edges.search import angle_deg
+from sst_graph.edges.turns import turned_states
 from sst_graph.graph.matching import DriveEdges
 from sst_graph.graph.outer_loop import JointSolution
 from sst_graph.graph.state import State, difference
@@ -23,10 +24,6 @@ SCORE_WORK = 5
 """A score of some scans, in units of work (:mod:`sst_graph.stepwise`)."""
 BLUR_PX = 2.0
 """Blur of the scores that are compared [px]."""
-_TURNS = 24
-"""Random rotations that the estimate is compared with."""
-_TURN_DEG = (2.0, 4.0)
-"""Their angles [deg]."""
 _APART_DEG = 1.0
 """Other solutions farther than this are other optima [deg]."""
 MIN_CONTRAST = 6.0
@@ -86,16 +83,6 @@ def edge_contrast_steps(
     other = max((score(edges, each, BLUR_PX) for each in apart), default=0.0)
     yield SCORE_WORK * (1 + len(apart))
     return contrast_of(own, around, other)
-
-
-def turned_states(state: State, seed: int) -> list[State]:
-    """The state turned in random ways; those with one seed are turned alike."""
-    rng = np.random.default_rng(seed)
-    axes = rng.normal(size=(_TURNS, 3))
-    axes /= np.linalg.norm(axes, axis=1)[:, None]
-    turns = np.radians(rng.uniform(*_TURN_DEG, _TURNS))[:, None] * axes
-    poses = [gtsam.Pose3(gtsam.Rot3.ClosestTo(R), state.cTl.translation()) for R in turned(state.cTl, turns)]
-    return [State(pose, state.time_offsets_s, state.biases_px) for pose in poses]
 
 
 def contrast_of(own: float, around: Sequence[float], other: float = 0.0) -> EdgeContrast:

@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
         with atomic_directory(args.out, args.overwrite, CALIBRATION) as folder:
             read_as = options_of(args)
             sources = open_drives(args)
-            config = dataclasses.replace(with_method_for(config, sources), profiles=not args.no_report)
+            config = dataclasses.replace(with_method_for(config, sources), for_report=not args.no_report)
             if config.method not in ("motion", "edges"):
                 check_classes(sources, config.classes, args.classes)
             warn_of_other_pairs(args.init, read_as)

@@ -44,9 +44,7 @@ def add_inspect(commands: Commands) -> argparse.ArgumentParser:
         "--next", type=int, default=10, metavar="N", help="frames to record next (default %(default)s)"
     )
     inspect.add_argument("--json", action="store_true", help="print JSON (units in the names)")
-    inspect.add_argument(
-        "--plots", type=Path, metavar="DIR", help="folder for plots as PNG (needs matplotlib)"
-    )
+    inspect.add_argument("--plots", type=Path, metavar="DIR", help="folder for plots as PNG")
     inspect.add_argument("--overwrite", action="store_true", help="replace earlier plots in DIR")
     return inspect
 

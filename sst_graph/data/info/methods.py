@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-_BY_LABELS = ("joint", "paper", "semalign", "track")
+_BY_LABELS = ("joint", "paper", "semalign")
 _BY_MOTION = ("motion",)
 _BY_PICTURES = ("edges", "motion", "paper")
 _NO_SEARCH = ("paper", "semalign")
@@ -37,6 +37,9 @@ def missing_for(content: Content) -> dict[str, tuple[str, ...]]:
 
 
 def _missing(method: str, content: Content) -> list[str]:
+    if method == "track":  # its method is auto: by edges where a sensor has no labels
+        labelled = content.point_classes and content.mask_classes
+        method = "joint" if labelled or not content.pictures else "edges"
     fewest = 2 if method in _BY_MOTION else 1
     found = []
     if content.scans < fewest:

@@ -64,7 +64,7 @@ class PaperTableConfig(Settings):
         failed_deg, failed_m: rotation (QAD) or translation (ATD) beyond which a run has failed.
         label_noise: of the simulator.
         jobs: processes; each takes a drive.
-        plot: also draw the runs (needs matplotlib).
+        plot: also draw the runs.
         calibration: settings of every method.
     """
 

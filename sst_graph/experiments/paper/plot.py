@@ -1,4 +1,4 @@
-"""A table's runs as a plot: a dot a run. Needs matplotlib (the extra ``plot``), imported when it is drawn."""
+"""A table's runs as a plot: a dot a run. matplotlib is imported when it is drawn."""
 
 from __future__ import annotations
 

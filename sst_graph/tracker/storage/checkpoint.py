@@ -38,7 +38,7 @@ from sst_graph.files.object_store import (
     restored,
     stored,
 )
-from sst_graph.files.reading import FileKind, parse_json, read_file
+from sst_graph.files.reading import FileKind, parse_json, path_of, read_file
 from sst_graph.odometry.sweep import SweepDecision
 from sst_graph.tracker.make_update import current_update
 from sst_graph.tracker.storage.resume import Setup, check_inputs, check_setup
@@ -102,7 +102,7 @@ class Saver:
     """
 
     def __init__(self, path: str | Path) -> None:
-        self._path = path
+        self._path = path_of(path, "a checkpoint")
         self._blocks = Blocks(checkpoint_classes())
         self._saved: Tracker | None = None
         self._writing: Generator[None] | None = None
@@ -295,12 +295,13 @@ def _read(path: str | Path) -> tuple[dict[str, Any], memoryview]:
         CheckpointError: no such file, or another one.
     """
     try:
+        path = path_of(path, CHECKPOINT.name)
         head, data = _members(read_file(path, CHECKPOINT), path)
         document = parse_json(head, path, CHECKPOINT.name, max_depth=_MAX_DEPTH)
     except CheckpointError:
         raise
     except DataError as error:
-        raise CheckpointError(path, error.found, error.expected) from None
+        raise CheckpointError(error.place, error.found, error.expected) from None
     found = (document.get("format"), document.get("version")) if isinstance(document, dict) else (None, None)
     if found != (FORMAT, VERSION):
         raise CheckpointError(

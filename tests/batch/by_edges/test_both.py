@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -15,19 +16,22 @@ from stored import simulated
 from sst_graph import CalibrationConfig, calibrate
 from sst_graph.batch.by_edges.both import fuse_parts
 from sst_graph.batch.by_edges.choice import with_method_for, with_method_of
-from sst_graph.batch.by_edges.fusion import Fused
+from sst_graph.batch.by_edges.fusion import Fused, state_of
 from sst_graph.batch.by_edges.label_parts import split_by_labels
 from sst_graph.batch.calibrate import prepare_drives
-from sst_graph.batch.method_estimate import MethodEstimate
-from sst_graph.batch.problem import CalibrationProblem
+from sst_graph.batch.method_estimate import MethodEstimate, result_of
+from sst_graph.batch.problem import CalibrationProblem, MatchedDrives
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
 from sst_graph.factors.robust import RobustKernel
+from sst_graph.fit import EDGES_QUALITY, FitQuality
 from sst_graph.graph.matching import edges_of, match_all
 from sst_graph.graph.outer_loop import JointSolution, solve_joint
 from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
+from sst_graph.inspect.verdict import fit_line, quality_line
 from sst_graph.metrics import calibration_errors
+from sst_graph.report import ReportInputs, report_html
 from sst_graph.simulator import SimulationConfig
 from sst_graph.types import Frame, Guess, SemanticClass
 
@@ -246,6 +250,73 @@ def test_what_is_not_sound_is_left_out() -> None:
         fuse_parts("none", "nothing")
 
 
+# --- how both fit
+
+
+@cache
+def fused() -> tuple[MethodEstimate, Guess]:
+    """Labels and edges that are each a little off, and their start."""
+    truth = simulated(SMALL).truth
+    assert truth is not None
+    guess, sigmas = Guess(truth.cTl.retract(AWAY)), np.array([2e-3] * 3 + [0.02] * 3 + [0.003])
+    found = []
+    for drive, sign in zip(parts(), (1.0, -1.0), strict=True):
+        step = sign * np.array([*np.radians([0.02, -0.05, 0.05]), 0.01, -0.01, 0.01])
+        own = estimate(truth.cTl.retract(step), SMALL.time_offset_s, sigmas)
+        problem = CalibrationProblem.of([drive], guess, CalibrationConfig(method="both"))
+        own = replace(own, matched=MatchedDrives(problem, state_of(own)))
+        found.append(replace(own, diagnostics={"kind": sign}))
+    return fuse_parts(*found), guess
+
+
+def test_labels_and_edges_are_measured_apart_at_the_estimate_of_both() -> None:
+    both, _ = fused()
+    labels, edges = both.fit, both.edges_fit
+    assert labels is not None and not labels.by_edges and edges is not None and edges.by_edges
+    assert set(labels.points.classes.tolist()) == {VEHICLE} and set(edges.points.classes.tolist()) == {OBJECT}
+    # Frames with labels have no edges.
+    paired = {(frame.scan, frame.image) for frame in labels.frames}
+    assert paired and not paired & {(frame.scan, frame.image) for frame in edges.frames}
+    assert labels.profiles == edges.profiles == labels.iterations == edges.iterations == ()
+    for fit, drive in ((labels, parts()[0]), (edges, parts()[1])):
+        problem = CalibrationProblem.of([drive], fused()[1], CalibrationConfig(method="both"))
+        own = problem.fit_at(State(both.cTl, (both.time_offset_s,)))
+        assert own is not None and own.quality == fit.quality
+        assert fit.quality.share_at_start is not None and fit.quality.share > fit.quality.share_at_start
+
+
+def test_the_page_has_a_section_of_each() -> None:
+    both, guess = fused()
+    result = result_of(both, [prepared()], guess, CalibrationConfig(method="both"))
+    of_labels, of_edges = (fit.quality for fit in result.fits)
+    assert FitQuality.from_diagnostics(result.diagnostics) == of_labels
+    assert FitQuality.from_diagnostics(result.diagnostics, EDGES_QUALITY) == of_edges
+    assert fit_line(result) == (
+        f"labels: {quality_line(of_labels)}; edges in frames without labels: {quality_line(of_edges)}"
+    )
+    page = report_html(ReportInputs(result, [with_labels_in(SMALL, 2)]))
+    headings = re.findall(r"<h2>([^<]*)</h2>", page)
+    assert headings[2:-1] == [
+        "Before and after",
+        "Telling objects: labels",
+        "Telling objects: edges, in frames without labels",
+        "Residuals: labels",
+        "Residuals: edges, in frames without labels",
+    ]
+    names = re.findall(r'<section id="([^"]*)"', page)
+    assert len(names) == len(set(names)) == len(headings)
+    assert "% of the information of the labels. " in page and "% of the information of the edges. " in page
+    of_edges_alone = page[page.index("residuals-edges") : page.index('id="background"')]
+    assert "label" not in of_edges_alone.replace("frames without labels", "").replace("aria-label", "")
+
+
+def test_a_part_that_is_used_alone_keeps_its_fit() -> None:
+    both, _ = fused()
+    labels = replace(both, fit=both.fit, edges_fit=None)
+    assert fuse_parts(labels, "nothing in view").fit is both.fit
+    assert fuse_parts(labels, "nothing in view").edges_fit is None
+
+
 # --- the whole method
 
 
@@ -262,6 +333,9 @@ def test_a_street_with_labels_in_every_second_frame() -> None:
     sigmas = np.sqrt(np.diag(result.covariance))
     assert all((sigmas < np.array(said[kind]["sigmas"])).all() for kind in ("labels", "edges"))
     assert 10 <= len(result.frames_used) <= 16
+    labels, edges = result.fits
+    assert edges.by_edges and not labels.by_edges and labels.quality.share > 0.6
+    assert edges.quality.by_chance is not None and edges.quality.share > 1.5 * edges.quality.by_chance
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,8 +31,9 @@ def test_what_is_missing_for_which_method() -> None:
     assert missing_for(EVERYTHING) == {method: () for method in METHODS}
     nothing = Content(20, 20, True, frozenset(), frozenset(), True)
     labels = ("labels of points", "semantic masks of images")
-    without = ("edges", "motion")
+    without = ("edges", "motion", "track")
     assert missing_for(nothing) == {method: () if method in without else labels for method in METHODS}
+    assert missing_for(replace(nothing, pictures=False))["track"] == labels
     blind = Content(1, 20, False, frozenset({"pole"}), frozenset({"vehicle"}), False)
     found = missing_for(blind)
     assert found["motion"] == ("scans", "pictures", "a nominal extrinsic (--init none does without)")
@@ -63,4 +65,4 @@ def test_a_drive_without_labels(kitti_drive: Path, capsys: pytest.CaptureFixture
     assert main(["info", str(kitti_drive), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["scans"]["labelled_points"] == 0.0
-    assert found["missing"]["motion"] == [] and found["missing"]["track"] == ["labels of points"]
+    assert found["missing"]["motion"] == [] and found["missing"]["joint"] == ["labels of points"]

@@ -111,5 +111,5 @@ def test_a_plot_has_the_methods_below_its_dots(name: str) -> None:
 
 def test_without_matplotlib(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(MissingDependencyError, match=r"sst-graph\[plot\].*plot=false"):
+    with pytest.raises(MissingDependencyError, match=r"pip install matplotlib, or --set plot=false"):
         check_plot()
