@@ -20,8 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError, EstimationError
-from sst_graph.factors.arguments import checked_type
+from sst_graph.factors.arguments import checked_array, checked_gtsam, checked_number, checked_type
 from sst_graph.factors.custom.variables import checked_keys
+from sst_graph.factors.errors import FactorError
+from sst_graph.files.checked_values import checked_pose
 from sst_graph.files.json_table import JsonTable, json_table
 from sst_graph.files.reading import MARGINAL, parse_json, read_text
 from sst_graph.types import ByValue, Calibration
@@ -48,9 +50,13 @@ class CalibrationMarginal(ByValue):
 
     Attributes:
         cTl, time_offset_s: linearization point.
-        information: (7, 7) symmetric, positive semi-definite.
+        information: (7, 7) symmetric; positive semi-definite but for a part of a tracker's frames.
         vector: (7,) information times the optimum's d; zero where the point is the optimum.
         constant: twice the cost at d = 0.
+
+    Raises:
+        FactorError: other types or shapes, values NaN or inf, or an information that is not symmetric.
+        DataError: a pose whose rotation is none.
     """
 
     cTl: gtsam.Pose3
@@ -58,6 +64,22 @@ class CalibrationMarginal(ByValue):
     information: FloatArray
     vector: FloatArray
     constant: float = 0.0
+
+    def __post_init__(self) -> None:
+        of = "of CalibrationMarginal"
+        checked_gtsam(f"cTl {of}", self.cTl, gtsam.Pose3)
+        checked_pose(np.asarray(self.cTl.matrix()), f"cTl {of}")
+        information = checked_array(f"information {of}", self.information, (7, 7))
+        if not _symmetric(_unit(information)):
+            raise FactorError(f"information {of}", "a matrix that is not symmetric", "an information matrix")
+        plain = {
+            "time_offset_s": checked_number(f"time_offset_s {of}", self.time_offset_s),
+            "information": information,
+            "vector": checked_array(f"vector {of}", self.vector, (7,)),
+            "constant": checked_number(f"constant {of}", self.constant),
+        }
+        for name, value in plain.items():
+            object.__setattr__(self, name, value)
 
     def factor(self, E_key: int = EXTRINSIC, D_key: int = TIME_OFFSET) -> gtsam.LinearContainerFactor:
         """The cost as a factor on the given keys; it pickles and serializes, and needs gtsam only.
@@ -201,15 +223,28 @@ def _information(table: JsonTable) -> FloatArray:
     diagonal = np.diag(L)
     if (diagonal < 0.0).any():
         raise DataError(place, f"{diagonal.min():.3g} on the diagonal", "at least 0")
-    # A direction may have no information: rounding is measured by the largest entry.
-    scale = np.sqrt(np.maximum(diagonal, 1e-12 * diagonal.max(initial=0.0) + 1e-300))
-    unit = L / scale[:, None] / scale
-    if (np.abs(unit - unit.T) > 1e-6).any():
+    unit = _unit(L)
+    if not _symmetric(unit):
         raise DataError(place, "a matrix that is not symmetric", "an information matrix")
     least = float(np.linalg.eigvalsh(unit)[0])
     if least < -1e-6:
         raise DataError(place, f"the eigenvalue {least:.3g} (scaled)", "a positive semi-definite matrix")
     return L
+
+
+def _unit(information: FloatArray) -> FloatArray:
+    """An information with a diagonal of ones, so that its entries can be compared.
+
+    A direction may have no information: rounding is measured by the largest entry.
+    """
+    diagonal = np.abs(np.diag(information))
+    scale = np.sqrt(np.maximum(diagonal, 1e-12 * diagonal.max(initial=0.0) + 1e-300))
+    return np.asarray(information / scale[:, None] / scale)
+
+
+def _symmetric(unit: FloatArray) -> bool:
+    """Whether it is, but for rounding."""
+    return bool((np.abs(unit - unit.T) <= 1e-6).all())
 
 
 def carried(marginal: CalibrationMarginal, cTl: gtsam.Pose3, time_offset_s: float) -> CalibrationMarginal:

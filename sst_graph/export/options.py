@@ -45,5 +45,8 @@ class ExportOptions:
         for name in (self.camera_frame, self.camera_link, self.lidar_frame, self.parent, self.child):
             if name is not None and not _NAME.fullmatch(name.replace(CAMERA, "c").replace(NUMBER, "0")):
                 raise ConfigError(f"frame name {name!r}: expected letters, digits, '_', '/', '.', single '-'")
+        if self.camera_frame is not None and self.camera_frame == self.camera_link:
+            found = f"frame name {self.camera_frame!r}: found for the optical frame and the link"
+            raise ConfigError(f"{found}, expected two names")
         if self.lidar_frame in (self.camera_frame, self.camera_link):
             raise ConfigError(f"frame name {self.lidar_frame!r}: found for both sensors, expected two names")

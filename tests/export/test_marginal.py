@@ -469,3 +469,37 @@ def test_what_is_no_marginal_is_refused(name: str) -> None:
     for call in calls.values():
         with pytest.raises((FactorError, SstGraphError)):
             call()
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        ({"cTl": None}, "cTl of CalibrationMarginal: found None"),
+        (
+            {"cTl": gtsam.Pose3(gtsam.Rot3(np.diag([1.0, 1.0, -1.0])), np.zeros(3))},
+            "expected a rotation matrix",
+        ),
+        ({"time_offset_s": "x"}, "time_offset_s of CalibrationMarginal: found the text 'x'"),
+        ({"information": np.eye(6)}, r"found shape \(6, 6\)"),
+        ({"information": np.eye(7) + np.diag([0.5], 6)}, "a matrix that is not symmetric"),
+        ({"information": np.ma.masked_equal(np.eye(7), 1.0)}, "7 masked values"),
+        ({"vector": np.full(7, np.nan)}, "7 values NaN or inf"),
+    ],
+)
+def test_a_marginal_of_other_parts_is_refused(change: dict[str, object], found: str) -> None:
+    given = {"cTl": gtsam.Pose3(), "time_offset_s": 0.0, "information": np.eye(7), "vector": np.zeros(7)}
+    assert CalibrationMarginal(**given).covariance().shape == (7, 7)  # type: ignore[arg-type]
+    with pytest.raises(SstGraphError, match=found):
+        CalibrationMarginal(**{**given, **change})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("dtype", ["f2", ">f8", "g", "O"])
+def test_numbers_of_any_type_make_the_same_marginal(dtype: str) -> None:
+    whole = CalibrationMarginal(gtsam.Pose3(), 0.5, 4.0 * np.eye(7), np.zeros(7))
+    information = (4.0 * np.eye(7)).astype(dtype)
+    if dtype == "O":
+        with pytest.raises(FactorError, match="expected numbers"):
+            CalibrationMarginal(gtsam.Pose3(), 0.5, information, np.zeros(7))
+    else:
+        given = CalibrationMarginal(gtsam.Pose3(), np.array(0.5), information, np.zeros(7))  # type: ignore[arg-type]
+        assert given == whole and given.to_json() == whole.to_json()

@@ -396,3 +396,8 @@ def test_a_result_of_any_name(tmp_path: Path) -> None:
             assert edge == ("front_left_image_raw_optical_frame", "lidar")
         elif target in ("kalibr", "autoware"):
             yaml.safe_load(text)
+
+
+def test_optical_frame_and_link_have_two_names() -> None:
+    with pytest.raises(ConfigError, match="for the optical frame and the link, expected two names"):
+        ExportOptions("camera", "camera")
