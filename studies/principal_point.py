@@ -1,6 +1,7 @@
 """A principal point that is off, under several prevalences: status, errors in sigmas, NEES. Prints a table.
 
     OMP_NUM_THREADS=1 python -m studies.principal_point own-547 own-551 third-901 third-903 STOP PARKED
+    OMP_NUM_THREADS=1 python -m studies.principal_point own-547 --prevalence 0.1
 
 The prevalence is the probability beforehand that the camera matrix's principal point is wrong
 (:mod:`sst_graph.covariance.broken_assumptions`). Drives are those of :mod:`studies.edges_streets`, by labels.
@@ -29,17 +30,19 @@ PREVALENCES = (0.02, 0.1, 0.25)
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("names", nargs="+")
+    parser.add_argument("--prevalence", nargs="+", type=float, default=PREVALENCES)
+    options = parser.parse_args()
     config = CalibrationConfig(method="joint")
     print("| drive | cx, cy off by | prevalence | status | worst axis | NEES / 7 | sigmas |")
     print("|---" * 7 + "|")
-    for name in parser.parse_args().names:
+    for name in options.names:
         source = source_of(name)
         truth, kept = source.truth, KeptDrive.of(source)
         assert truth is not None
         start = truth.cTl.retract(start_step(name))
         for off in OFF_PX:
             drives = prepare_drives([with_principal_point(kept, *off)], config)
-            for prevalence in PREVALENCES:
+            for prevalence in options.prevalence:
                 believed = {n: replace(ASSUMPTIONS[n], prevalence=prevalence) for n in ("cx", "cy")}
                 with mock.patch.dict(ASSUMPTIONS, believed):
                     result = calibrate_prepared(drives, start, config)

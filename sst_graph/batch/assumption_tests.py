@@ -118,7 +118,8 @@ def examine_assumptions(
     """Test the assumptions against the data, and consider in the covariance what the data leave open.
 
     Args:
-        further: tests by other data than the matches, asked where these contradict nothing.
+        further: tests by other data than the matches, asked where these contradict nothing. What they
+            contradict counts; what they leave open is considered as the matches have it.
 
     Returns:
         The tests, the most contradicted first, and what the assumptions add to the covariance.
@@ -126,7 +127,7 @@ def examine_assumptions(
     config, state = problem.config.assumptions, estimate.solution.state
     findings = check_assumptions(SolvedProblem(problem, estimate.solution), config)
     if config.test and not any(finding.contradicted for finding in findings):
-        findings = combined_tests(findings, further(problem, state), config.threshold)
+        findings = with_further_tests(findings, further(problem, state), config.threshold)
     considered = estimate.considered(config)
     return findings, with_test_results(considered, findings)
 
@@ -251,11 +252,16 @@ def _solved_alone(
     return replace(finding, value=value, sigma=sigma) if same else finding
 
 
-def combined_tests(
+def with_further_tests(
     tests: Sequence[ParameterTest], others: Sequence[ParameterTest], threshold: float
 ) -> tuple[ParameterTest, ...]:
-    """Tests of the same parameters by data that do not share an error, as one for each parameter, weighted by
-    their variances; the most contradicted first."""
+    """Tests by matches, with those parameters that other data contradict together with them; the most
+    contradicted first.
+
+    Args:
+        others: tests of the same parameters by data that do not share an error: the two are weighted by their
+            variances.
+    """
     found = {each.assumption.name: each for each in tests}
     for other in others:
         name = other.assumption.name
@@ -263,7 +269,8 @@ def combined_tests(
         weights = np.array([each.sigma**-2.0 for each in both])
         value = float(weights @ [each.value for each in both] / weights.sum())
         sigma = float(weights.sum() ** -0.5)
-        found[name] = replace(other, value=value, sigma=sigma, contradicted=abs(value) > threshold * sigma)
+        if abs(value) > threshold * sigma:
+            found[name] = ParameterTest(other.assumption, value, sigma, True)
     return tuple(sorted(found.values(), key=lambda each: -each.score))
 
 

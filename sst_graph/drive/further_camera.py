@@ -27,6 +27,7 @@ from sst_graph.errors import DataError
 from sst_graph.files.array_store import ArrayStore
 from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.relative import relative_pose
+from sst_graph.odometry.sweep import SweptSource
 from sst_graph.odometry.visual import ImagePair
 from sst_graph.types import Frame, SemanticClass, Source
 from sst_graph.validation import checked_image
@@ -69,7 +70,7 @@ def with_camera(
         left_out=left_out,
         statistics=_statistics(drive, scans, seen),
         origin_ns=None,
-        frames=NumberedFrames(source, {number_at(source, p): p for p in range(len(source))}),
+        frames=_frames(drive, source),
     )
 
 
@@ -100,6 +101,12 @@ def _images(
                 pairs.append(ImagePair(tracks, relative_pose(tracks, source.camera)))
         images.append(image_features(index, image, classes, config.image_edges).stored_in(store))
     return images, pairs, left_out, collector.statistics()
+
+
+def _frames(drive: Drive, source: Source) -> NumberedFrames:
+    """The other camera's frames, their scans with the sweep of the drive."""
+    swept = source if drive.sweep is None else SweptSource(source, drive.sweep)
+    return NumberedFrames(swept, {number_at(source, p): p for p in range(len(source))})
 
 
 def _scan_numbers(drive: Drive, source: Source) -> list[int]:

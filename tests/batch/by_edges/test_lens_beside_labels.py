@@ -1,0 +1,111 @@
+"""The principal point of an estimate by labels, tested by edges of some frames."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from stored import simulated
+
+from sst_graph import CalibrationConfig, SemanticClass, calibrate
+from sst_graph.assumptions import ASSUMPTIONS
+from sst_graph.batch.assumption_tests import ParameterTest, with_further_tests
+from sst_graph.batch.by_edges.lens import lens_beside_labels
+from sst_graph.batch.calibrate import prepare_drives
+from sst_graph.batch.problem import CalibrationProblem
+from sst_graph.config import with_overrides
+from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.drive.edges_of_frames import with_edges
+from sst_graph.drive.preparation import Drive, PrepareConfig
+from sst_graph.experiments.wrong_drives import with_principal_point
+from sst_graph.features.picture_gradients import PictureGradients
+from sst_graph.graph.state import State
+from sst_graph.simulator import SimulationConfig
+from sst_graph.types import Guess
+
+STREET = SimulationConfig(
+    seed=504,
+    frames=12,
+    motion="no_stop",
+    azimuth_limit_deg=50.0,
+    width=828,
+    height=250,
+    vehicle_density=0.3,
+)
+CONFIG = CalibrationConfig(decide_sweep=False)
+TRUTH = State(simulated(STREET).truth.cTl, (simulated(STREET).truth.time_offset_s,))
+
+
+def drive(right_px: float = 0.0) -> Drive:
+    """The street, its principal point this far from the one given."""
+    kept = with_principal_point(KeptDrive.of(simulated(STREET)), right_px, 0.0)
+    return prepare_drives([kept], CONFIG)[0]
+
+
+def found(own: Drive) -> dict[str, ParameterTest]:
+    """What edges say, from an estimate that makes up for a principal point by a turn, as labels do."""
+    turned = (own.camera.cx - simulated(STREET).camera.cx) / own.camera.fx
+    state = replace(TRUTH, cTl=TRUTH.cTl.retract(np.array([0.0, 0.0, turned, 0.0, 0.0, 0.0])))
+    problem = CalibrationProblem.of([own], Guess(TRUTH.cTl, TRUTH.time_offsets_s[0]), CONFIG)
+    return {each.assumption.name: each for each in lens_beside_labels(problem, state)}
+
+
+def test_the_right_principal_point_is_not_contradicted() -> None:
+    tests = found(drive())
+    assert set(tests) == {"cx", "cy"}
+    assert not any(each.contradicted for each in tests.values())
+    assert tests["cx"].sigma < 3.0
+
+
+@pytest.mark.parametrize("right_px", [8.0, -8.0])
+def test_a_wrong_one_is_found(right_px: float) -> None:
+    cx = found(drive(right_px))["cx"]
+    assert cx.contradicted and cx.value == pytest.approx(right_px, abs=2.5)
+
+
+def test_frames_without_pictures_or_that_cannot_be_read_tell_nothing() -> None:
+    own, pairs = drive(), [(0, 0), (3, 3)]
+    assert with_edges(replace(own, frames=None), pairs, PrepareConfig()) is None
+    blank = KeptDrive.of(simulated(STREET)).with_images(
+        lambda image: replace(image, pixels=np.zeros((0, 0, 3), np.uint8))
+    )
+    assert with_edges(prepare_drives([blank], CONFIG)[0], pairs, PrepareConfig()) is None
+
+
+def test_edges_of_the_chosen_frames_alone() -> None:
+    own = drive()
+    chosen = with_edges(own, [(1, 2), (4, 5)], PrepareConfig())
+    assert chosen is not None and len(chosen.scans) == len(own.scans)
+    assert [bool(scan.boundaries) for scan in chosen.scans] == [k in (1, 4) for k in range(12)]
+    assert all(set(scan.boundaries) <= {SemanticClass.OBJECT} for scan in chosen.scans)
+    with_gradients = [k for k, image in enumerate(chosen.images) if image.contours]
+    assert with_gradients == [2, 5]
+    assert isinstance(chosen.images[2].contours[SemanticClass.OBJECT], PictureGradients)
+    # Those of the drive itself are as they were.
+    assert own.scans[1].boundaries and SemanticClass.OBJECT not in own.scans[1].boundaries
+
+
+def test_two_tests_of_a_parameter_are_weighted_by_their_variances() -> None:
+    cx, k1 = ASSUMPTIONS["cx"], ASSUMPTIONS["k1"]
+    labels = (ParameterTest(k1, 0.01, 0.005, False), ParameterTest(cx, 6.0, 4.0, False))
+    edges = (ParameterTest(cx, 8.0, 2.0, True),)
+    first, second = with_further_tests(labels, edges, 3.3)
+    assert first.assumption is cx and first.contradicted
+    assert first.value == pytest.approx((6.0 / 16 + 8.0 / 4) / (1 / 16 + 1 / 4))
+    assert first.sigma == pytest.approx((1 / 16 + 1 / 4) ** -0.5)
+    assert second == labels[0]
+    # What stays open together is considered as the labels have it.
+    weak = (ParameterTest(cx, 3.0, 2.0, False),)
+    assert set(with_further_tests(labels, weak, 3.3)) == set(labels)
+
+
+@pytest.mark.slow
+def test_a_result_by_labels_is_not_ok_with_a_wrong_principal_point() -> None:
+    street = KeptDrive.of(simulated(replace(STREET, seed=507, frames=24, motion="mixed")))
+    config = with_overrides(CONFIG, ["find_causes=false"])
+    right, wrong = (calibrate(with_principal_point(street, px, 0.0), TRUTH.cTl, config) for px in (0.0, 6.0))
+    assert right.status == "ok"
+    assert wrong.status == "not_converged"
+    assert wrong.reasons[0].startswith("the pictures lie beside the principal point cx: cx = ")
+    assert wrong.diagnostics["assumptions"]["cx"]["estimate"] == pytest.approx(6.0, abs=2.5)
