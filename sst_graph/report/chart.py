@@ -95,7 +95,7 @@ class Chart:
     def dots(
         self, x: ArrayLike, y: ArrayLike, colour: str, size: float = 2.5, titles: Sequence[str] = ()
     ) -> None:
-        """Points, of a radius; titles are shown under the pointer."""
+        """Points, all finite, of a radius; titles are shown under the pointer."""
         style: dict[str, Any] = {"color": _COLOURS[colour], "s": (2.0 * size) ** 2, "lw": 0}
         style |= {"zorder": 3, "clip_on": False}
         self._add(f"dots {colour}", lambda axes, gid: axes.scatter(x, y, gid=gid, **style), titles)
@@ -103,10 +103,7 @@ class Chart:
     def band(self, x: ArrayLike, low: ArrayLike, high: ArrayLike, colour: str, name: str = "") -> None:
         """The area between two lines."""
         style: dict[str, Any] = {"color": _COLOURS[colour], "label": name, "lw": 0, "alpha": 0.18}
-        self._add(
-            f"band {colour}",
-            lambda axes, gid: axes.fill_between(x, low, high, gid=gid, **style),
-        )
+        self._add(f"band {colour}", lambda axes, gid: axes.fill_between(x, low, high, gid=gid, **style))
 
     def bars(
         self, x: ArrayLike, heights: ArrayLike, width: float, colour: str, titles: Sequence[str]
@@ -192,9 +189,8 @@ class Chart:
             look: dict[str, Any] = {"frameon": False, "borderpad": 0.1, "borderaxespad": 0}
             look |= {"handlelength": 1.4, "handletextpad": 0.4, "columnspacing": 1.0}
             figure.legend(handles, names, loc="lower center", ncols=len(names), **look)
-        box = [
-            f"{one:.1f}" for one in (left - 1, _TOP - 1, wide + 2, high + 2)
-        ]  # lines at the border are whole
+        # A unit wider all around: lines along the border stay whole.
+        box = [f"{one:.1f}" for one in (left - 1, _TOP - 1, wide + 2, high + 2)]
         return {**dict(zip(("x", "y", "width", "height"), box, strict=True)), "viewBox": " ".join(box)}
 
     def _for_the_page(self, written: bytes, inside: dict[str, str]) -> str:
@@ -221,9 +217,8 @@ class Chart:
                 mark = self._marks[int(name[5:])]
                 element.set("class", mark.kind)
                 parts = [one for one in element.iter() if one.tag in ("path", "use")]
-                if any(
-                    one.get("clip-path") for one in element.iter()
-                ):  # by an SVG of their own: a clip path would need an id that is the page's only one
+                # Cut by an SVG of its own: a clip path needs an id, which the whole page has but once.
+                if any(one.get("clip-path") for one in element.iter()):
                     element.tag = "svg"
                     element.attrib |= inside
                 for part, title in zip(parts, mark.titles, strict=False):
