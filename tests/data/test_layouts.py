@@ -100,6 +100,7 @@ def test_motion_needs_neither_labels_nor_tr(tmp_path: Path, capsys: pytest.Captu
     assert "brings no nominal calibration: give --init none" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_raw_pictures_as_recorded_are_rectified(tmp_path: Path) -> None:
     raw = as_kitti_raw(written(CROWDED_STREET) / "sequences" / "00", tmp_path / "raw")
     plain = open_source(raw)

@@ -52,6 +52,7 @@ def test_a_checkpoint_keeps_the_relinearization(begun: tuple[Path, list[Frame]])
     )
 
 
+@pytest.mark.slow
 def test_the_window_is_relinearized_with_the_frames_that_come(begun: tuple[Path, list[Frame]]) -> None:
     tracker, coming = Tracker.load(begun[0]), begun[1]
     oldest, sizes = tracker.inputs.window.first_scan, []
@@ -73,6 +74,7 @@ def test_the_window_is_relinearized_with_the_frames_that_come(begun: tuple[Path,
     np.testing.assert_allclose(np.diag(tracker.estimate.covariance), np.diag(covariance), rtol=0.5)
 
 
+@pytest.mark.slow
 def test_a_relinearization_that_was_begun_again_ends_alike(begun: tuple[Path, list[Frame]]) -> None:
     once, again, coming = Tracker.load(begun[0]), Tracker.load(begun[0]), begun[1]
     again.estimate.stop_relinearization()

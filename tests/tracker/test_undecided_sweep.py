@@ -40,6 +40,7 @@ def test_the_mean_square_of_the_changes_is_added_and_said_where_it_matters() -> 
     assert not decided.covariance.any() and decided.sentence == ""
 
 
+@pytest.mark.slow
 def test_tracker_and_batch_agree_about_it(tmp_path: Path) -> None:
     drive = KeptDrive.of(simulated(SLOW), sweep="auto")
     source = with_sweep(drive)
