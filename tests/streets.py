@@ -151,3 +151,15 @@ def turned(image: CameraImage, street: SimulatedDrive, R: gtsam.Rot3, **border: 
 def knocked(image: CameraImage, street: SimulatedDrive, degrees: float) -> CameraImage:
     """The image of a camera turned about its vertical axis."""
     return turned(image, street, gtsam.Rot3.Ry(np.radians(degrees)), borderMode=cv2.BORDER_REPLICATE)
+
+
+LENS_STREET = SimulationConfig(
+    seed=504,
+    frames=12,
+    motion="no_stop",
+    azimuth_limit_deg=50.0,
+    width=828,
+    height=250,
+    vehicle_density=0.3,
+)
+"""A street whose lens edges tell."""

@@ -9,7 +9,6 @@ import numpy as np
 
 from sst_graph.drive.preparation import (
     Drive,
-    ImageFeatures,
     PrepareConfig,
     ScanFeatures,
     scan_features,
@@ -33,7 +32,7 @@ def with_edges(drive: Drive, pairs: Sequence[tuple[int, int]], config: PrepareCo
     if drive.frames is None:
         return None
     store, objects = ArrayStore(config.in_memory_bytes), (SemanticClass.OBJECT,)
-    images, scans = [_without_contours(image) for image in drive.images], [*map(_empty, drive.scans)]
+    images, scans = [image.with_contours({}) for image in drive.images], [*map(_empty, drive.scans)]
     for k in sorted({image for _, image in pairs}):
         image = drive.frames.image(images[k].index)
         if image is not None and image.has_picture and image.stamp_ns == images[k].stamp_ns:
@@ -48,11 +47,6 @@ def with_edges(drive: Drive, pairs: Sequence[tuple[int, int]], config: PrepareCo
     if not any(scan.boundaries for scan in scans):
         return None
     return replace(drive, scans=tuple(scans), images=tuple(images))
-
-
-def _without_contours(image: ImageFeatures) -> ImageFeatures:
-    """The image; its mask as it is kept, not read from the store."""
-    return ImageFeatures(image.index, image.stamp_ns, vars(image)["mask"], {})
 
 
 def _empty(scan: ScanFeatures) -> ScanFeatures:

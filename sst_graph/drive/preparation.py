@@ -137,6 +137,10 @@ class ImageFeatures:
         contours = {c: contour.stored_in(store) for c, contour in self.contours.items()}
         return replace(self, mask=store.put(self.mask), contours=contours)
 
+    def with_contours(self, contours: dict[SemanticClass, ContourMap | PictureGradients]) -> ImageFeatures:
+        """The image with other contours; its mask as it is kept, not read from the store."""
+        return ImageFeatures(self.index, self.stamp_ns, vars(self)["mask"], contours)
+
     def __getstate__(self) -> dict[str, Any]:
         """The mask, packed, and the picture's edges, not the distances that follow from them."""
         edges = {

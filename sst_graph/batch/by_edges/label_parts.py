@@ -68,4 +68,4 @@ def _by_labels(scan: ScanFeatures) -> ScanFeatures:
 
 def _image_of(image: ImageFeatures, by_edges: bool) -> ImageFeatures:
     kept = {c: each for c, each in image.contours.items() if (c == SemanticClass.OBJECT) == by_edges}
-    return ImageFeatures(image.index, image.stamp_ns, vars(image)["mask"], kept)
+    return image.with_contours(kept)

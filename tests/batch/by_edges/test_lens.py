@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from stored import simulated
+from streets import LENS_STREET as STREET
 
 from sst_graph import CalibrationConfig, calibrate
 from sst_graph.assumptions import ASSUMPTIONS
@@ -26,15 +27,6 @@ from sst_graph.simulator import SimulationConfig
 from sst_graph.stepwise import run_to_end
 from sst_graph.types import Guess
 
-STREET = SimulationConfig(
-    seed=504,
-    frames=12,
-    motion="no_stop",
-    azimuth_limit_deg=50.0,
-    width=828,
-    height=250,
-    vehicle_density=0.3,
-)
 SIGMAS = np.array([*np.radians([0.1] * 3), 0.02, 0.02, 0.02, 0.005])
 COVARIANCE = np.diag(SIGMAS**2)
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from stored import simulated
+from streets import LENS_STREET as STREET
 
 from sst_graph import CalibrationConfig, SemanticClass, calibrate
 from sst_graph.assumptions import ASSUMPTIONS
@@ -21,18 +22,8 @@ from sst_graph.drive.preparation import Drive, PrepareConfig
 from sst_graph.experiments.wrong_drives import with_principal_point
 from sst_graph.features.picture_gradients import PictureGradients
 from sst_graph.graph.state import State
-from sst_graph.simulator import SimulationConfig
 from sst_graph.types import Guess
 
-STREET = SimulationConfig(
-    seed=504,
-    frames=12,
-    motion="no_stop",
-    azimuth_limit_deg=50.0,
-    width=828,
-    height=250,
-    vehicle_density=0.3,
-)
 CONFIG = CalibrationConfig(decide_sweep=False)
 TRUTH = State(simulated(STREET).truth.cTl, (simulated(STREET).truth.time_offset_s,))
 
