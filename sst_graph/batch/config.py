@@ -136,9 +136,9 @@ class CalibrationConfig(Settings):
 
 
 def prepared_classes(config: CalibrationConfig) -> tuple[SemanticClass, ...]:
-    """Classes that drives are prepared with: edges need objects of no class, motion is judged by them."""
+    """Classes that drives are prepared with: edges need objects of no class, motion needs none."""
     if config.method == "edges":
         return (SemanticClass.OBJECT,)
     if config.method == "motion":
-        return (SemanticClass.OBJECT,) if config.for_report else ()
+        return ()
     return (*config.classes, SemanticClass.OBJECT) if config.method == "both" else config.classes

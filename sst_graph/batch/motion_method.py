@@ -6,16 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sst_graph.batch.by_edges.problem import with_fewer_points
+from sst_graph.batch.by_edges.problem import problem_of_some_frames, with_fewer_points
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import MethodEstimate
-from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.fit import Fit
 from sst_graph.graph.state import difference
 from sst_graph.hand_eye.solution import MotionSolution, alternative, solve_motion
 from sst_graph.inspect.gained import KEY, pair_gains, to_document
-from sst_graph.quality.fit_of_solution import has_edges
 from sst_graph.result import FrameId
 from sst_graph.types import Guess
 
@@ -25,7 +23,7 @@ def motion_method(
 ) -> MethodEstimate:
     """LiDAR odometry against visual odometry; labels only leave out what may move.
 
-    The estimate uses no edges. Those of drives that were prepared with some judge it: its fit is theirs.
+    The estimate uses no edges. Those of some frames, read again, judge it: its fit is theirs.
 
     Raises:
         EstimationError: too few consecutive frames with known motion.
@@ -56,11 +54,14 @@ def motion_method(
 def check_by_edges(
     drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, solution: MotionSolution
 ) -> Fit | None:
-    """How a solution, which has used no edge, fits those of the pictures; None of drives that have none."""
-    if not has_edges(drives):
-        return None
-    problem = with_fewer_points(CalibrationProblem.of(drives, guess, config))
-    return problem.fit_at(solution.state, solution.iterations)
+    """How a solution, which has used no edge, fits those of some frames; None where no picture has any.
+
+    Raises:
+        DataError: a frame cannot be read again.
+    """
+    offsets_s = [solution.state.time_offset_s(number) for number in range(len(drives))]
+    some = problem_of_some_frames(drives, offsets_s, guess, config)
+    return None if some is None else with_fewer_points(some[0]).fit_at(solution.state, solution.iterations)
 
 
 def _turned_deg(solution: MotionSolution) -> float:

@@ -15,6 +15,8 @@ FloatArray = NDArray[np.float64]
 
 _TAKES_PART = 0.1
 """Least part of a weak direction's unit vector that is named."""
+_WITH_ROTATION = 0.3
+"""Least part of both rotation and time offset in a direction that is said to be of the two."""
 _ALONG_AXIS = 0.95
 """Least component of a rotation's unit vector along an axis that is named instead of it (18 deg)."""
 _PAIR_CORRELATION = 0.98
@@ -41,17 +43,17 @@ class Advice:
 
 SILHOUETTES = Advice(
     together="record a stop, a change of speed or a turn",
-    offset="record motion: several frames at some speed, with a change of speed or a turn",
+    offset="record motion, several frames at some speed, with a change of speed or a turn",
     rotation="record objects on all sides of the image, near and far",
     translation="record objects nearer to the sensors, at several distances",
 )
 """For calibration by objects that both sensors see."""
 MOTION = Advice(
     together="record turns to both sides, at different speeds",
-    offset="record turns that begin and end, or a rough road: where turning changes, the time offset is seen",
-    rotation="record turns: a straight drive leaves the rotation about its direction open",
-    translation="record tight turns and ramps, or use method joint: motion without turns leaves the "
-    "translation open, and motion in a plane the height",
+    offset="record turns that begin and end, or a rough road (the offset is seen where turning changes)",
+    rotation="record turns (a straight drive leaves the rotation about its direction open)",
+    translation="record tight turns and ramps, or use method joint (motion without turns leaves the "
+    "translation open, and motion in a plane the height)",
 )
 """For calibration by motion alone."""
 
@@ -199,15 +201,22 @@ def _words(
             f"{abs(time_offset_s) * 1e3:.1f} ms)",
             advice.together,
         )
+    angle_deg = float(np.degrees(np.linalg.norm(rotation)))
+    if min(parts["offset"], parts["rotation"]) > _WITH_ROTATION:
+        sign = "later" if time_offset_s * rotation[np.abs(rotation).argmax()] > 0 else "earlier"
+        return (
+            f"the LiDAR turned about {_rotation_axis(rotation)} cannot be distinguished from the image "
+            f"taken {sign} (one sigma: {angle_deg:.2f} deg, {abs(time_offset_s) * 1e3:.1f} ms)",
+            advice.offset,
+        )
     if parts["offset"] >= max(parts["rotation"], parts["translation"]):
         return (
             f"the time offset is known to {abs(time_offset_s) * 1e3:.1f} ms only (one sigma)",
             advice.offset,
         )
     if parts["rotation"] > parts["translation"]:
-        angle = np.degrees(float(np.linalg.norm(rotation)))
         return (
-            f"the rotation is known to {angle:.2f} deg only (one sigma) about {_rotation_axis(rotation)}",
+            f"the rotation is known to {angle_deg:.2f} deg only (one sigma) about {_rotation_axis(rotation)}",
             advice.rotation,
         )
     return (

@@ -37,7 +37,9 @@ def residual_charts(fit: Fit, camera: PinholeCamera) -> list[str]:
         _by_frame(fit),
         _by_object(fit),
         _over_picture(fit, camera),
-        _binned(points, np.linalg.norm(points.lPs, axis=1), "range [m]", "Over the range", _RANGE),
+        _binned(
+            points, np.linalg.norm(points.lPs, axis=1), "range [m]", "Over the range", _range_caption(fit)
+        ),
         _binned(
             points,
             np.degrees(np.arctan2(points.lPs[:, 1], points.lPs[:, 0])),
@@ -48,14 +50,18 @@ def residual_charts(fit: Fit, camera: PinholeCamera) -> list[str]:
     ]
 
 
-_RANGE = (
-    "Median and middle half of the residuals. A trend towards near points is an error of the translation; "
-    "one at all ranges alike is one of the rotation (or of masks)."
-)
 _AZIMUTH = (
     "Median and middle half of the residuals. Steps or slopes that are wider than the band speak of a wrong "
     "focal length, a distortion or a sweep that is not compensated."
 )
+
+
+def _range_caption(fit: Fit) -> str:
+    also = "" if fit.by_edges else " (or of masks)"
+    return (
+        "Median and middle half of the residuals. A trend towards near points is an error of the "
+        f"translation; one at all ranges alike is one of the rotation{also}."
+    )
 
 
 def _histogram(fit: Fit) -> str:

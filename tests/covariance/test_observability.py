@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple
+
 import gtsam
 import numpy as np
 import pytest
 
 from sst_graph.covariance.observability import (
+    MOTION,
+    SILHOUETTES,
     ObservabilityConfig,
     inseparable_directions,
     weak_directions,
 )
+from sst_graph.inspect.reasons import short_reason
 from sst_graph.result import DIRECTION_SCALES
 
 CTL = gtsam.Pose3(
@@ -111,6 +116,16 @@ def test_shifts_are_named_in_the_camera(l_axis: int, words: tuple[str, str]) -> 
     assert f"shifted {words[0]}" in weak.sentence
 
 
+def test_a_rotation_that_goes_with_the_time_offset() -> None:
+    (weak,) = weak_directions(with_direction(np.array([0.03, 0, 0, 0, 0, 0, 0.02])), CTL, CONFIG)
+    about = "the LiDAR turned about the LiDAR's x axis cannot be distinguished from the image taken later"
+    assert weak.sentence == f"{about} (one sigma: 1.72 deg, 20.0 ms)" and "motion" in weak.advice
+    (other,) = weak_directions(with_direction(np.array([-0.03, 0, 0, 0, 0, 0, 0.02])), CTL, CONFIG)
+    assert "taken earlier" in other.sentence
+    (alone,) = weak_directions(with_direction(np.array([0.003, 0, 0, 0, 0, 0, 0.2])), CTL, CONFIG)
+    assert alone.sentence == "the time offset is known to 200.0 ms only (one sigma)"
+
+
 def test_the_weakest_first_and_only_past_the_limits() -> None:
     sigmas = np.array([0.001, 0.001, 0.02, 0.3, 0.01, 0.01, 0.001])
     found = weak_directions(np.diag(sigmas**2), CTL, CONFIG)
@@ -118,3 +133,9 @@ def test_the_weakest_first_and_only_past_the_limits() -> None:
     assert [int(np.abs(weak.vector).argmax()) for weak in found] == [3, 2]
     wide = ObservabilityConfig(rotation_deg=2.0, translation_m=0.5, time_offset_s=0.01)
     assert weak_directions(np.diag(sigmas**2), CTL, wide) == ()
+
+
+@pytest.mark.parametrize("remedy", [*astuple(SILHOUETTES), *astuple(MOTION)])
+def test_advice_is_one_clause(remedy: str) -> None:
+    short = short_reason(f"the time offset is known to 20.0 ms only (one sigma): {remedy}")
+    assert short.startswith("the time offset is known to 20.0 ms only: record ")

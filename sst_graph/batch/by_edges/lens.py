@@ -21,25 +21,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.association.time_pairing import pair_by_time
 from sst_graph.assumptions import ASSUMPTIONS, named_sigmas
 from sst_graph.batch.assumption_tests import ParameterTest, few_objects_factor
 from sst_graph.batch.by_edges.covariance import half_sample_steps
 from sst_graph.batch.by_edges.optimum import START_KERNELS_PX
-from sst_graph.batch.by_edges.problem import LabelEstimate, edges_problem
+from sst_graph.batch.by_edges.problem import LabelEstimate, edges_problem, problem_of_some_frames
 from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX, solution_steps
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.covariance.shared_errors import FEWEST
-from sst_graph.drive.edges_of_frames import with_edges
-from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.matching import edges_of, match_all
 from sst_graph.graph.outer_loop import JointProblem, support_of
 from sst_graph.graph.state import State, difference
 from sst_graph.objects.tracks import ObjectId
-from sst_graph.sampling import evenly_spread
 from sst_graph.stepwise import Stepwise, run_to_end
 from sst_graph.types import Guess
 
@@ -57,14 +53,10 @@ another optimum: wide kernels have led there, past edges that lie closer. Where 
 met (by 1 to 13 %), and two solutions of one optimum differ by less than 0.1 %."""
 
 
-_SCANS = 20
-"""Scans of all drives that test the lens of an estimate by labels: two to four seconds."""
 _BESIDE_LABELS = ("cx", "cy")
-"""What they test of it. Outlines of a few vehicles know the principal point to 3 to 9 px, edges of these
+"""What edges test of it. Outlines of a few vehicles know the principal point to 3 to 9 px, edges of some
 scans to 1 to 5 px. Of focal length and k1 labels know enough, and KITTI's pictures, which are not quite those
 of their pinhole, would refuse estimates that this moves by less than their sigmas."""
-_APART_S = 0.3
-"""They come in pairs so far apart, so that objects are tracked from one to the other [s]."""
 
 
 @dataclass(frozen=True)
@@ -185,31 +177,14 @@ def lens_beside_labels(problem: CalibrationProblem, state: State) -> tuple[Param
         DataError: a frame cannot be read again.
     """
     # 1. Some frames once more, for their edges.
-    most = max(2, _SCANS // len(problem.drives))
-    drives, offsets_s = [], []
-    for number, drive in enumerate(problem.drives):
-        offset_s = state.time_offset_s(number)
-        own = with_edges(drive, _some_pairs(drive, offset_s, most), problem.config.prepare)
-        if own is not None:
-            drives.append(own)
-            offsets_s.append(offset_s)
-    if not drives:
+    offsets_s = [state.time_offset_s(number) for number in range(len(problem.drives))]
+    some = problem_of_some_frames(problem.drives, offsets_s, Guess(state.cTl, offsets_s[0]), problem.config)
+    if some is None:
         return ()
-    # 2. The lens by these, from the estimate. Objects in so few scans have no bias of their own.
+    # 2. The lens by these, from the estimate.
+    calibration, offsets_s = some
     clocks = tuple(offsets_s[: len(state.time_offsets_s)])
     held = State(state.cTl, clocks, nuisances=dict(state.nuisances))
-    noise = replace(problem.config.noise, object_bias_sigma_px=0.0)
-    config, guess = replace(problem.config, noise=noise), Guess(state.cTl, offsets_s[0])
-    calibration = CalibrationProblem.of(drives, guess, config)
     edges = edges_problem(calibration, None, LabelEstimate(held, True)).whole
     found = run_to_end(lens_steps(edges, held, calibration.objects, problem.config.assumptions))
     return tuple(each for each in found.findings if each.assumption.name in _BESIDE_LABELS)
-
-
-def _some_pairs(drive: Drive, time_offset_s: float, most: int) -> list[tuple[int, int]]:
-    """Scans with their images in true time: pairs of scans, spread over the drive."""
-    found = pair_by_time(drive.scan_stamps_ns, drive.image_stamps_ns, time_offset_s, drive.image_period_s)
-    apart = max(1, round(_APART_S / drive.scan_period_s))
-    firsts = evenly_spread(range(max(1, len(found) - apart)), most // 2)
-    chosen = sorted({k for first in firsts for k in (first, first + apart) if k < len(found)})
-    return [(found[k].scan, found[k].image) for k in chosen]

@@ -16,6 +16,7 @@ from sst_graph.batch.by_edges.parts import thinned
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.motion_factor import gaussian_factor
 from sst_graph.batch.problem import CalibrationProblem
+from sst_graph.drive.edges_of_frames import with_some_edges
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.edges.search import KnownRotation, SearchRegion, angle_deg
 from sst_graph.errors import EstimationError
@@ -32,6 +33,8 @@ SEARCH_SCANS = 12
 """Scans of each drive that starts are compared on."""
 POINTS_A_SCAN = 1000
 """Most boundary points of a scan that are matched: neighbours on one edge tell the same."""
+SOME_SCANS = 20
+"""Scans of all drives that are read again for their edges: two to four seconds."""
 _GUESS_SIGMA_DEG = 3.5
 """Sigma, by axis, of the rotation of a guess that starts are searched around [deg]."""
 _REACH_SIGMAS, _MOST_DEG = 2.2, 25.0
@@ -124,6 +127,27 @@ def motion_alone(
 def with_fewer_points(calibration: CalibrationProblem) -> CalibrationProblem:
     """The problem with no more boundary points than are matched with edges."""
     return replace(calibration, drives=[thinned(drive, POINTS_A_SCAN) for drive in calibration.drives])
+
+
+def problem_of_some_frames(
+    drives: Sequence[Drive], time_offsets_s: Sequence[float], guess: Guess, config: CalibrationConfig
+) -> tuple[CalibrationProblem, list[float]] | None:
+    """The edges of some frames of drives that were prepared without, read again, and the time offset of each
+    drive that has some; None where none has. In so few scans objects have no bias of their own, and are
+    taken for static.
+
+    Args:
+        time_offsets_s: of each drive.
+
+    Raises:
+        DataError: a frame cannot be read again.
+    """
+    some = with_some_edges(drives, time_offsets_s, SOME_SCANS, config.prepare)
+    if not some:
+        return None
+    config = replace(config, noise=replace(config.noise, object_bias_sigma_px=0.0))
+    problem = CalibrationProblem.of([*some.values()], guess, config)
+    return problem, [time_offsets_s[number] for number in some]
 
 
 def edges_problem(
