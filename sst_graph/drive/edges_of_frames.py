@@ -7,45 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from sst_graph.association.time_pairing import pair_by_time
 from sst_graph.drive.preparation import Drive, PrepareConfig, ScanFeatures, scan_features
 from sst_graph.features.picture_gradients import PictureGradients
 from sst_graph.files.array_store import ArrayStore
-from sst_graph.sampling import evenly_spread
 from sst_graph.types import SemanticClass
-
-_APART_S = 0.3
-"""Scans come in pairs so far apart, so that objects are tracked from one to the other [s]."""
-
-
-def with_some_edges(
-    drives: Sequence[Drive], time_offsets_s: Sequence[float], most: int, config: PrepareConfig
-) -> dict[int, Drive]:
-    """By position, the drives with edges of some scans each, spread over it (:func:`with_edges`); without
-    those that have none.
-
-    Args:
-        time_offsets_s: of each drive.
-        most: scans of all drives together, two of each at least.
-
-    Raises:
-        DataError: a frame cannot be read, or cannot be used.
-    """
-    share = max(2, most // max(1, len(drives)))
-    found = {
-        number: with_edges(drive, _some_pairs(drive, offset_s, share), config)
-        for number, (drive, offset_s) in enumerate(zip(drives, time_offsets_s, strict=True))
-    }
-    return {number: drive for number, drive in found.items() if drive is not None}
-
-
-def _some_pairs(drive: Drive, time_offset_s: float, most: int) -> list[tuple[int, int]]:
-    """Scans with their images in true time: pairs of scans, spread over the drive."""
-    found = pair_by_time(drive.scan_stamps_ns, drive.image_stamps_ns, time_offset_s, drive.image_period_s)
-    apart = max(1, round(_APART_S / drive.scan_period_s))
-    firsts = evenly_spread(range(max(1, len(found) - apart)), most // 2)
-    chosen = sorted({k for first in firsts for k in (first, first + apart) if k < len(found)})
-    return [(found[k].scan, found[k].image) for k in chosen]
 
 
 def with_edges(drive: Drive, pairs: Sequence[tuple[int, int]], config: PrepareConfig) -> Drive | None:

@@ -16,8 +16,8 @@ from sst_graph.batch.by_edges.parts import thinned
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.motion_factor import gaussian_factor
 from sst_graph.batch.problem import CalibrationProblem
-from sst_graph.drive.edges_of_frames import with_some_edges
-from sst_graph.drive.preparation import Drive, Progress
+from sst_graph.drive.edges_of_frames import with_edges
+from sst_graph.drive.preparation import Drive, PrepareConfig, Progress
 from sst_graph.edges.search import KnownRotation, SearchRegion, angle_deg
 from sst_graph.errors import EstimationError
 from sst_graph.graph.matching import DriveEdges, Tracks, edges_of
@@ -33,8 +33,10 @@ SEARCH_SCANS = 12
 """Scans of each drive that starts are compared on."""
 POINTS_A_SCAN = 1000
 """Most boundary points of a scan that are matched: neighbours on one edge tell the same."""
-SOME_SCANS = 20
+_SOME_SCANS = 20
 """Scans of all drives that are read again for their edges: two to four seconds."""
+_APART_S = 0.3
+"""Scans come in pairs so far apart, so that objects are tracked from one to the other [s]."""
 _GUESS_SIGMA_DEG = 3.5
 """Sigma, by axis, of the rotation of a guess that starts are searched around [deg]."""
 _REACH_SIGMAS, _MOST_DEG = 2.2, 25.0
@@ -142,12 +144,41 @@ def problem_of_some_frames(
     Raises:
         DataError: a frame cannot be read again.
     """
-    some = with_some_edges(drives, time_offsets_s, SOME_SCANS, config.prepare)
+    some = _with_some_edges(drives, time_offsets_s, config.prepare)
     if not some:
         return None
     config = replace(config, noise=replace(config.noise, object_bias_sigma_px=0.0))
     problem = CalibrationProblem.of([*some.values()], guess, config)
     return problem, [time_offsets_s[number] for number in some]
+
+
+def _with_some_edges(
+    drives: Sequence[Drive], time_offsets_s: Sequence[float], config: PrepareConfig
+) -> dict[int, Drive]:
+    """By position, the drives with edges of some scans each, spread over it (:func:`with_edges`); without
+    those that have none.
+
+    Args:
+        time_offsets_s: of each drive.
+
+    Raises:
+        DataError: a frame cannot be read, or cannot be used.
+    """
+    share = max(2, _SOME_SCANS // max(1, len(drives)))
+    found = {
+        number: with_edges(drive, _some_pairs(drive, offset_s, share), config)
+        for number, (drive, offset_s) in enumerate(zip(drives, time_offsets_s, strict=True))
+    }
+    return {number: drive for number, drive in found.items() if drive is not None}
+
+
+def _some_pairs(drive: Drive, time_offset_s: float, most: int) -> list[tuple[int, int]]:
+    """Scans with their images in true time: pairs of scans, spread over the drive."""
+    found = pair_by_time(drive.scan_stamps_ns, drive.image_stamps_ns, time_offset_s, drive.image_period_s)
+    apart = max(1, round(_APART_S / drive.scan_period_s))
+    firsts = evenly_spread(range(max(1, len(found) - apart)), most // 2)
+    chosen = sorted({k for first in firsts for k in (first, first + apart) if k < len(found)})
+    return [(found[k].scan, found[k].image) for k in chosen]
 
 
 def edges_problem(
