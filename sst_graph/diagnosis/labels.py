@@ -18,6 +18,8 @@ _LEAST_CONTRAST = 1.3
 """Of masks over their own pictures: 1.6 and more on streets and real drives; over others 0.3 to 1.1 ..."""
 _MOST_RIVAL = 0.75
 """... and there the second best shift has this share of the best one or more; over their own up to 0.7."""
+_SMOOTH = 0.95
+"""Share of the points labelled ground on slopes: 0.99 and more of ground, 0.9 and less of other things."""
 _ABOVE = 0.1
 """Ground whose mean row is higher than the vehicles' or the sky's by this share of the image is no ground."""
 
@@ -44,9 +46,9 @@ def searched_classes(drives: Sequence[Drive], classes: Sequence[SemanticClass]) 
 
 
 def ground_points(drive: Drive) -> Finding | None:
-    """Points labelled ground that do not lie on a plane."""
+    """Points labelled ground that lie on no plane, nor on slopes as of hills."""
     ground = None if drive.statistics is None else usual_ground(drive.statistics)
-    if ground is None or ground.share >= FLAT:
+    if ground is None or ground.share >= FLAT or ground.smooth >= _SMOOTH:
         return None
     return Finding(
         "the class numbers of the points are mixed up",

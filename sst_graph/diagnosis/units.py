@@ -14,13 +14,16 @@ from sst_graph.drive.preparation import Drive
 
 FloatArray = NDArray[np.float64]
 
-_CAR_HEIGHT_M, _HIGHEST_VEHICLE_M = 1.5, 3.6
-"""Most vehicles are cars; the median of a drive among trucks and buses stays below their 4 m."""
+_CAR_HEIGHT_M, _HIGHEST_CAR_M, _HIGHEST_VEHICLE_M = 1.5, 3.0, 4.4
+"""Most vehicles are cars; trucks and buses are 4.3 m high at most. The median of drives among trucks is above
+that of cars: then the height of the LiDAR decides."""
 _LOWEST_VEHICLE_M = 0.5
-"""Of the highest quarter: cars that are seen in part still show more [m]."""
+"""Of the highest quarter: cars that are seen in part still show more, where the ground is in view [m]."""
 _HIGHEST_LIDAR_M = 4.5
 """On the roof of a truck [m]."""
 _LEAST_VEHICLES = 5
+_LOG_TRUCKS = 1.1
+"""Logarithm of how many times as high as a car the highest trucks are."""
 _LENGTH_UNITS = {1000.0: "millimetres", 100.0: "centimetres", 1.0 / 0.3048: "feet", 1.0 / 0.0254: "inches"}
 _UPRIGHT = 0.7
 """Cosine between two directions that are the same one, roughly."""
@@ -37,7 +40,9 @@ def clouds(drive: Drive) -> Finding | None:
     if len(heights) < _LEAST_VEHICLES or (ground is not None and ground.share < FLAT):
         return None
     middle, upper = float(np.median(heights)), float(np.quantile(heights, 0.75))
-    if upper > _LOWEST_VEHICLE_M and middle < _HIGHEST_VEHICLE_M:
+    high = ground is not None and ground.height > _HIGHEST_LIDAR_M
+    highest = _HIGHEST_CAR_M if high else _HIGHEST_VEHICLE_M
+    if middle < highest and (ground is None or upper > _LOWEST_VEHICLE_M):
         return None
     if middle <= 0.0:
         return Finding(
@@ -56,7 +61,9 @@ def clouds(drive: Drive) -> Finding | None:
                 "compare the class numbers of the labels with their table, then the unit of the clouds",
             )
     unit = min(_LENGTH_UNITS, key=lambda factor: abs(np.log(scale / factor)))
-    named = f"{_LENGTH_UNITS[unit]}, not metres" if abs(np.log(scale / unit)) < 0.5 else "not in metres"
+    named = (
+        f"{_LENGTH_UNITS[unit]}, not metres" if -0.5 < np.log(scale / unit) < _LOG_TRUCKS else "not in metres"
+    )
     factor = unit if "not metres" in named else scale
     return Finding(
         f"the clouds are {'in ' if 'not metres' in named else ''}{named}",
@@ -77,6 +84,18 @@ def axes(drive: Drive, guess: gtsam.Pose3 | None) -> Finding | None:
         "the clouds are in the camera's axes (x right, y down, z forward)",
         f"the ground's normal is ({x:.2f}, {y:.2f}, {z:.2f}), expected (0, 0, 1)",
         "give clouds in the LiDAR's axes (x forward, y left, z up), and a start that goes with them",
+    )
+
+
+def origin(drive: Drive) -> Finding | None:
+    """Clouds whose origin lies on the ground: no LiDAR is there."""
+    ground = None if drive.statistics is None else usual_ground(drive.statistics)
+    if ground is None or ground.share < FLAT or ground.height > 0.5 * ground.tolerance:
+        return None
+    return Finding(
+        "the clouds are in the frame of the vehicle (base_link), not of the LiDAR",
+        f"their origin lies on the ground, to {ground.height:.2g} m",
+        "give the clouds as the LiDAR measures them: edges are found along its beams",
     )
 
 
@@ -113,5 +132,7 @@ def usual_ground(statistics: InputStatistics) -> Ground | None:
     return Ground(
         up / max(float(np.linalg.norm(up)), 1e-9),
         float(np.median([ground.height for ground in grounds])),
+        float(np.median([ground.tolerance for ground in grounds])),
         float(np.median([ground.share for ground in grounds])),
+        float(np.median([ground.smooth for ground in grounds])),
     )

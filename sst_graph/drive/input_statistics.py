@@ -13,6 +13,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from sst_graph.features.mask_shift import ContourProfile, contour_profiles
 from sst_graph.types import CameraImage, Frame, Scan, SemanticClass
@@ -25,6 +26,8 @@ _LEAST_POINTS = 200
 """Labelled points of the ground from which a plane is fitted."""
 _GROUND_TOLERANCE = 0.02
 """Distance from the plane, as a share of the median range of the points, within which a point lies on it."""
+_STEEPEST, _AROUND = 0.3, 8
+"""Steepest slope between a point of the ground and half of so many points around it."""
 _OBJECT_POINTS = 60
 """Points of a vehicle from which its size is taken."""
 _CELL = 0.02
@@ -39,12 +42,17 @@ class Ground:
     Attributes:
         up: (3,) unit normal, from the ground towards the LiDAR.
         height: of the LiDAR above it.
+        tolerance: distance within which a point lies on it.
         share: of the points that lie on it.
+        smooth: share of the points that lie on a slope of :data:`_STEEPEST` at most with those around them,
+            as on hills.
     """
 
     up: FloatArray
     height: float
+    tolerance: float
     share: float
+    smooth: float
 
 
 @dataclass(frozen=True)
@@ -138,7 +146,8 @@ def scan_statistics(index: int, scan: Scan, closely: bool = True) -> ScanStatist
         sweep = float(np.ptp(np.asarray(scan.offsets_s, np.float64)))
     ground, heights = None, np.zeros(0)
     if closely:
-        ground = _ground(points[np.isin(scan.classes, _GROUND)])
+        on_ground = np.isin(scan.classes, _GROUND)
+        ground = _ground(points[on_ground], points[~on_ground])
         member = (scan.classes == int(SemanticClass.VEHICLE)) & (ranges < 2.0 * median_range)
         instances = None if scan.instances is None else scan.instances[member]
         heights = _heights(points[member], instances, ground)
@@ -200,8 +209,9 @@ def _counts(classes: NDArray[np.uint8]) -> dict[int, int]:
     return {int(c): int(counts[c]) for c in np.flatnonzero(counts)}
 
 
-def _ground(points: FloatArray) -> Ground | None:
-    """The plane that most of the points (n, 3) lie on (RANSAC, then least squares)."""
+def _ground(points: FloatArray, others: FloatArray) -> Ground | None:
+    """The plane that most of the points (n, 3) lie on (RANSAC, then least squares). Where the LiDAR itself
+    lies on it, the other points (m, 3) tell what is up."""
     if len(points) < _LEAST_POINTS:
         return None
     points = points[:: max(1, len(points) // 2000)]
@@ -221,7 +231,18 @@ def _ground(points: FloatArray) -> Ground | None:
         on = np.abs((points - centre) @ normal) < tolerance
     height = -float(normal @ centre)
     up = normal if height >= 0.0 else -normal
-    return Ground(up, abs(height), float(on.mean()))
+    if abs(height) < tolerance and np.count_nonzero(others @ up < 0.0) > 0.5 * len(others):
+        up = -up
+    return Ground(up, abs(height), tolerance, float(on.mean()), _smooth(points, up, 0.5 * tolerance))
+
+
+def _smooth(points: FloatArray, up: FloatArray, tolerance: float) -> float:
+    """Share of the points (n, 3) that lie on a slope with half of those around them."""
+    levels, flat = points @ up, points @ np.linalg.svd(up[None])[2][1:].T
+    distances, around = cKDTree(flat).query(flat, _AROUND + 1)
+    steps = np.abs(levels[around] - levels[:, None])[:, 1:]
+    on = steps < _STEEPEST * distances[:, 1:] + tolerance
+    return float((on.mean(axis=1) >= 0.5).mean())
 
 
 def _heights(points: FloatArray, instances: NDArray[np.uint16] | None, ground: Ground | None) -> FloatArray:
