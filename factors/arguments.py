@@ -9,6 +9,8 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sst_graph.factors.errors import count_of
+
 from .errors import FactorError
 
 FloatArray = NDArray[np.float64]
@@ -66,7 +68,7 @@ def as_numbers(what: str, value: ArrayLike, shape: str = "") -> FloatArray:
         shape: that is expected, for the message.
     """
     if (masked := masked_values(value)) > 0:
-        raise FactorError(what, f"{masked} masked values", "an array without a mask")
+        raise FactorError(what, count_of(masked, "masked value"), "an array without a mask")
     if isinstance(value, np.ndarray) and value.dtype == np.float64:
         return np.asarray(value)
     expected = f"numbers of shape {shape}" if shape else "numbers"
@@ -87,7 +89,8 @@ def masked_values(value: object) -> int:
 def checked_finite(what: str, array: FloatArray) -> None:
     """Nothing, where no value is NaN or inf."""
     if not np.isfinite(array).all():
-        raise FactorError(what, f"{np.count_nonzero(~np.isfinite(array))} values NaN or inf", "finite values")
+        bad = count_of(int(np.count_nonzero(~np.isfinite(array))), "value")
+        raise FactorError(what, f"{bad} NaN or inf", "finite values")
 
 
 def _wanted(shape: tuple[int | None, ...]) -> str:

@@ -9,6 +9,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.factors.errors import count_of
+
 from .arguments import as_numbers, checked_array, checked_number_or_array, checked_type, described
 from .camera import PinholeCamera
 from .errors import FactorError
@@ -109,7 +111,7 @@ class Alignment:
         try:
             return self._some(index, each if each.ndim == 1 else each[index])
         except IndexError:
-            expected = f"positions of some of {len(self)} matches"
+            expected = f"positions of some of {count_of(len(self), 'match', 'matches')}"
             raise FactorError("index of take", described(index), expected) from None
 
     def of_one_image(self, index: slice | NDArray[np.intp], c_acceleration: FloatArray) -> Alignment:

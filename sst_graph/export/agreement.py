@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from sst_graph.covariance.contradiction import Difference, PartEstimate, combined, name_step
-from sst_graph.errors import ContradictionError, EstimationError
+from sst_graph.errors import ContradictionError, EstimationError, count_of
 from sst_graph.graph.linear import unit_scale
 
 FloatArray = NDArray[np.float64]
@@ -60,7 +60,8 @@ def check_agreement(
     if 2.0 * p_value < significance:
         name = repr(names[worst]) if names else f"number {worst}"
         raise ContradictionError(
-            f"{len(parts)} marginals contradict one another (chi-squared {chi2:.0f} of {freedom}): {name} "
+            f"{count_of(len(parts), 'marginal')} contradict one another (chi-squared {chi2:.0f} of "
+            f"{freedom}): {name} "
             f"differs from the others in {name_step(against[worst], cTl).sentence}; fuse what was recorded "
             "with one mount and one clock, or give significance=0 to fuse all the same"
         )

@@ -16,7 +16,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.errors import EstimationError
+from sst_graph.errors import EstimationError, count_of
 from sst_graph.export.agreement import SIGNIFICANCE, check_agreement
 from sst_graph.factors.arguments import checked_type
 from sst_graph.factors.errors import FactorError
@@ -199,7 +199,7 @@ def fuse_graphs(
     for pair in graphs:
         checked_type("graphs", pair, (list, tuple), expected)
         if len(pair) != 2:
-            raise FactorError("graphs", f"{len(pair)} objects", expected)
+            raise FactorError("graphs", count_of(len(pair), "object"), expected)
     parts = [marginal_of_graph(graph, values, E_key, D_key) for graph, values in graphs]
     fused = fuse_marginals(parts, significance=significance)
     for _ in range(max_rounds):
@@ -209,7 +209,9 @@ def fuse_graphs(
         step = np.append(fused.cTl.localCoordinates(point.cTl), fused.time_offset_s - point.time_offset_s)
         if np.sqrt(step @ fused.information @ step) < tolerance_sigmas:
             return fused, parts
-    raise EstimationError(f"fusion of {len(graphs)} drives: still moving after {max_rounds} rounds")
+    raise EstimationError(
+        f"fusion of {count_of(len(graphs), 'drive')}: still moving after {count_of(max_rounds, 'round')}"
+    )
 
 
 def fuse_marginals(
@@ -242,7 +244,9 @@ def fuse_marginals(
     if not marginals:
         raise EstimationError("no marginal to fuse")
     if names and len(names) != len(marginals):
-        raise EstimationError(f"found {len(names)} names, expected {len(marginals)}, one a marginal")
+        raise EstimationError(
+            f"found {count_of(len(names), 'name')}, expected {len(marginals)}, one a marginal"
+        )
     fused = marginals[0]
     for _ in range(_MAX_ROUNDS):
         parts = [_carried(marginal, fused.cTl, fused.time_offset_s) for marginal in marginals]
@@ -259,7 +263,7 @@ def fuse_marginals(
             break
     else:
         raise EstimationError(
-            f"fusion of {len(marginals)} marginals: still moving after {_MAX_ROUNDS} rounds"
+            f"fusion of {count_of(len(marginals), 'marginal')}: still moving after {_MAX_ROUNDS} rounds"
         )
     check_agreement([(part.information, part.vector) for part in parts], fused.cTl, names, significance)
     return fused

@@ -57,7 +57,8 @@ def import_calibration(
 
     Raises:
         DataError: missing or unreadable, no known format or several, no calibration of one camera.
-        ConfigError: an unknown format, a camera whose name the format cannot have, or frames that it has none of.
+        ConfigError: an unknown format, a camera whose name the format cannot have, or frames that change
+            nothing in it.
         EstimationError: a marginal that leaves a direction open.
         MissingDependencyError: a YAML file, and PyYAML is not installed.
     """

@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 
 from sst_graph.data.nuscenes.tables import pose_of
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 from sst_graph.files.checked_values import checked_pose, checked_time_offset_s
 from sst_graph.files.json_table import JsonTable
 from sst_graph.files.yaml_file import number, numbers
@@ -152,7 +152,9 @@ def _record(records: list[Any], name: str | None, document: Document, what: str)
     if len(records) != 1:
         channels = ", ".join(map(_channel, records[:12]))
         option = "--camera NAME" if what == "camera" else "--lidar-frame NAME"
-        raise DataError(document.path, f"{len(records)} records of a {what} ({channels})", f"one: {option}")
+        raise DataError(
+            document.path, f"{count_of(len(records), 'record')} of a {what} ({channels})", f"one: {option}"
+        )
     return records[0]
 
 

@@ -115,7 +115,7 @@ def test_scans_that_are_given_twice_make_no_result_surer() -> None:
         drives = prepare_drives(given, CalibrationConfig())
         found = [finding.evidence for finding in preflight(drives, drive().nominal, CLASSES)]
         assert len(found) == count
-        assert all(sentence.startswith("1 scans of") for sentence in found)
+        assert all(sentence.startswith(f"{drive().name} has 1 scan of ") for sentence in found)
 
 
 def test_frames_without_content_are_no_repeated_ones() -> None:

@@ -444,7 +444,7 @@ def test_graphs_of_drives_with_two_mounts_are_refused() -> None:
         fuse_graphs(graphs)
     fused, _ = fuse_graphs(graphs, significance=0.0)
     assert in_sigmas(fused, *_batch(graphs)) < 1e-3
-    with pytest.raises(EstimationError, match="found 1 names, expected 2"):
+    with pytest.raises(EstimationError, match="found 1 name, expected 2"):
         fuse_marginals([agreeing(1), agreeing(2)], names=("a",))
 
 
