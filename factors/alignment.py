@@ -18,13 +18,11 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.factors.errors import count_of
-
 from .arguments import checked_array, checked_number, checked_positive, checked_type, described
 from .condensed import condense_gram, condense_root, cost_rows
 from .custom.factor import custom_factor, recipe_of
 from .custom.variables import Argument, Variables, Vector, checked_key, is_key, number_or_key, pose_or_key
-from .errors import FactorError
+from .errors import FactorError, count_of
 from .matches import Alignment, joined_points
 from .reprojection import Evaluated, alignment_cost, cost, evaluate, residuals, weigh, weighted_residuals
 

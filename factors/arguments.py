@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from typing import Any
 
@@ -9,9 +10,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sst_graph.factors.errors import count_of
-
-from .errors import FactorError
+from .errors import FactorError, count_of
 
 FloatArray = NDArray[np.float64]
 
@@ -24,6 +23,27 @@ def checked_type(what: str, value: Any, kind: type | tuple[type, ...], expected:
     """
     if not isinstance(value, kind):
         raise FactorError(what, described(value), expected)
+
+
+def checked_callback(what: str, value: Any, parameters: tuple[str, ...]) -> None:
+    """Nothing, where ``value`` is None, or can be called with these arguments.
+
+    Raises:
+        FactorError: it cannot.
+    """
+    if value is None:
+        return
+    expected = f"a function of ({', '.join(parameters)}), or None"
+    if not callable(value):
+        raise FactorError(what, described(value), expected)
+    try:
+        signature = inspect.signature(value)
+    except (TypeError, ValueError):  # some that are written in C do not tell theirs
+        return
+    try:
+        signature.bind(*parameters)
+    except TypeError:
+        raise FactorError(what, f"one with the arguments {signature}", expected) from None
 
 
 def checked_gtsam(what: str, value: Any, kind: type) -> None:

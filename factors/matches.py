@@ -9,11 +9,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.factors.errors import count_of
-
 from .arguments import as_numbers, checked_array, checked_number_or_array, checked_type, described
 from .camera import PinholeCamera
-from .errors import FactorError
+from .errors import FactorError, count_of
 from .motion import MotionModel, checked_model
 from .robust import RobustKernel
 

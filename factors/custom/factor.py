@@ -19,10 +19,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.factors.errors import count_of
-
 from ..arguments import checked_count, checked_type, described
-from ..errors import FactorError
+from ..errors import FactorError, count_of
 from .variables import Kind, Reader, checked_key, checked_keys, dimension, key_name
 
 FloatArray = NDArray[np.float64]

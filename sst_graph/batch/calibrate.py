@@ -43,7 +43,14 @@ from sst_graph.batch.total_covariance import total_covariance
 from sst_graph.config import expect_settings
 from sst_graph.covariance.considered import BUDGET
 from sst_graph.drive.geometric_labels import GeometricallyLabelled
-from sst_graph.drive.preparation import TRACK_INTERVAL_S, Drive, PrepareConfig, Progress, prepare_drive
+from sst_graph.drive.preparation import (
+    TRACK_INTERVAL_S,
+    Drive,
+    PrepareConfig,
+    Progress,
+    check_progress,
+    prepare_drive,
+)
 from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.odometry.sweep import with_sweep
 from sst_graph.result import CalibrationResult
@@ -75,7 +82,9 @@ def calibrate(
     Raises:
         DataError: the frames cannot be used.
         ConfigError: the settings contradict each other or the data.
+        FactorError: ``progress`` cannot be called so.
     """
+    check_progress(progress)
     sources = as_sources(frames)
     initial, initial_time_offset_s = checked_guess(initial, initial_time_offset_s)
     config = with_method_for(expect_settings(config, CalibrationConfig), sources)
@@ -95,6 +104,7 @@ def prepare_drives(
 ) -> list[Drive]:
     """Read each source once, and keep what the method needs; image features are tracked only where they are
     needed."""
+    check_progress(progress)
     config = with_method_for(config, sources)
     prepare = preparation_of(config)
     with_lower_edges = config.method in ("joint", "both") and config.lower_edges != "never"
@@ -127,6 +137,7 @@ def calibrate_prepared(
     progress: Progress | None = None,
 ) -> CalibrationResult:
     """:func:`calibrate` of drives from :func:`prepare_drives`, with the same settings."""
+    check_progress(progress)
     config = with_method_of(config or CalibrationConfig(), drives)
     guess = Guess(initial, initial_time_offset_s)
     method = _METHODS[config.method]

@@ -17,6 +17,7 @@ from sst_graph.drive.geometric_labels import labelled_by_geometry
 from sst_graph.drive.input_statistics import InputStatistics, StatisticsCollector
 from sst_graph.drive.trajectory import GrowingTrack, TwistTrack
 from sst_graph.errors import DataError, count_of
+from sst_graph.factors.arguments import checked_callback
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.lidar_edges import MAX_RANGE_M, Boundaries, Edge, find_boundaries
 from sst_graph.features.mask_contour import ContourMap
@@ -36,6 +37,15 @@ _LOG = logging.getLogger(__name__)
 FloatArray = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 """Called with (stage, steps done, steps in all)."""
+
+
+def check_progress(progress: object) -> None:
+    """Refuse what cannot be called as a :data:`Progress`; None is none.
+
+    Raises:
+        FactorError: it cannot.
+    """
+    checked_callback("progress", progress, ("stage", "done", "total"))
 
 
 SAMPLE_POINTS = 3000
