@@ -52,6 +52,7 @@ from sst_graph.drive.preparation import (
     prepare_drive,
 )
 from sst_graph.errors import ConfigError, EstimationError
+from sst_graph.marginal import MOST_SCAN_HASHES, SCAN_HASHES
 from sst_graph.odometry.sweep import with_sweep
 from sst_graph.result import CalibrationResult
 from sst_graph.types import Guess, Source
@@ -161,7 +162,16 @@ def finished(
     left_out = {drive.name: drive.left_out.counts() for drive in drives if drive.left_out.counts()}
     if left_out:
         diagnostics["left_out"] = left_out
+    if hashes := scan_hashes(drives):
+        diagnostics[SCAN_HASHES] = hashes
     return replace(result, diagnostics=diagnostics), estimate
+
+
+def scan_hashes(drives: Sequence[Drive]) -> list[str]:
+    """Of the drives' scans, the smallest ones: drives with a good part of their scans in common have some of
+    these in common."""
+    known = [drive.statistics.scan_hashes() for drive in drives if drive.statistics is not None]
+    return sorted(set().union(*known))[:MOST_SCAN_HASHES]
 
 
 def _check(sources: Sequence[Source], config: CalibrationConfig) -> None:
