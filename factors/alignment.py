@@ -22,7 +22,7 @@ from .arguments import checked_array, checked_number, checked_positive, checked_
 from .condensed import condense_gram, condense_root, cost_rows
 from .custom.factor import custom_factor, recipe_of
 from .custom.variables import Argument, Variables, Vector, checked_key, is_key, number_or_key, pose_or_key
-from .errors import FactorError
+from .errors import FactorError, count_of
 from .matches import Alignment, joined_points
 from .reprojection import Evaluated, alignment_cost, cost, evaluate, residuals, weigh, weighted_residuals
 
@@ -72,7 +72,7 @@ class GroupedBias:
         least, most = positions.min(initial=0), positions.max(initial=-1)
         if (positions != groups).any() or least < 0 or most >= len(self.biases):
             found = f"{groups.min():g} to {groups.max():g}"
-            expected = f"positions in {len(self.biases)} biases"
+            expected = f"positions in {count_of(len(self.biases), 'bias', 'biases')}"
             raise FactorError("groups of a GroupedBias", found, expected)
         object.__setattr__(self, "groups", positions)
         object.__setattr__(self, "biases", tuple(self.biases))
@@ -511,7 +511,9 @@ def _bias_of_each(alignments: Sequence[Alignment], biases_px: Any) -> list[int |
     if isinstance(biases_px, list | tuple):
         if len(biases_px) != len(alignments):
             raise FactorError(
-                "biases_px", f"{len(biases_px)} entries", f"{len(alignments)}, one an alignment"
+                "biases_px",
+                count_of(len(biases_px), "entry", "entries"),
+                f"{len(alignments)}, one an alignment",
             )
         biases = list(biases_px)
     else:
@@ -535,7 +537,9 @@ def _terms_of_each(
         return [()] * len(alignments)
     checked_type("terms", terms, (list, tuple), "a list of LinearTerm for each alignment")
     if len(terms) != len(alignments):
-        raise FactorError("terms", f"{len(terms)} entries", f"{len(alignments)}, one an alignment")
+        raise FactorError(
+            "terms", count_of(len(terms), "entry", "entries"), f"{len(alignments)}, one an alignment"
+        )
     for alignment, own in zip(alignments, terms, strict=True):
         checked_type("terms of an alignment", own, (list, tuple), "a list of LinearTerm")
         if own and alignment.normals is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from typing import Any
 
@@ -9,7 +10,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .errors import FactorError
+from .errors import FactorError, count_of
 
 FloatArray = NDArray[np.float64]
 
@@ -22,6 +23,27 @@ def checked_type(what: str, value: Any, kind: type | tuple[type, ...], expected:
     """
     if not isinstance(value, kind):
         raise FactorError(what, described(value), expected)
+
+
+def checked_callback(what: str, value: Any, parameters: tuple[str, ...]) -> None:
+    """Nothing, where ``value`` is None, or can be called with these arguments.
+
+    Raises:
+        FactorError: it cannot.
+    """
+    if value is None:
+        return
+    expected = f"a function of ({', '.join(parameters)}), or None"
+    if not callable(value):
+        raise FactorError(what, described(value), expected)
+    try:
+        signature = inspect.signature(value)
+    except (TypeError, ValueError):  # some that are written in C do not tell theirs
+        return
+    try:
+        signature.bind(*parameters)
+    except TypeError:
+        raise FactorError(what, f"one with the arguments {signature}", expected) from None
 
 
 def checked_gtsam(what: str, value: Any, kind: type) -> None:
@@ -66,7 +88,7 @@ def as_numbers(what: str, value: ArrayLike, shape: str = "") -> FloatArray:
         shape: that is expected, for the message.
     """
     if (masked := masked_values(value)) > 0:
-        raise FactorError(what, f"{masked} masked values", "an array without a mask")
+        raise FactorError(what, count_of(masked, "masked value"), "an array without a mask")
     if isinstance(value, np.ndarray) and value.dtype == np.float64:
         return np.asarray(value)
     expected = f"numbers of shape {shape}" if shape else "numbers"
@@ -87,7 +109,8 @@ def masked_values(value: object) -> int:
 def checked_finite(what: str, array: FloatArray) -> None:
     """Nothing, where no value is NaN or inf."""
     if not np.isfinite(array).all():
-        raise FactorError(what, f"{np.count_nonzero(~np.isfinite(array))} values NaN or inf", "finite values")
+        bad = count_of(int(np.count_nonzero(~np.isfinite(array))), "value")
+        raise FactorError(what, f"{bad} NaN or inf", "finite values")
 
 
 def _wanted(shape: tuple[int | None, ...]) -> str:

@@ -20,6 +20,16 @@ def printable(text: object, limit: int = MAX_MESSAGE) -> str:
     return _shortened(shown, limit)
 
 
+def count_of(count: int, one: str, several: str | None = None) -> str:
+    """``1 pair``, ``0 pairs``, ``2 pairs``.
+
+    Args:
+        one: the noun of one.
+        several: that of several, where it is not ``one`` with an s.
+    """
+    return f"{count} {one if count == 1 else several or one + 's'}"
+
+
 def _shortened(text: str, limit: int) -> str:
     if len(text) <= limit:
         return text

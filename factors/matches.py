@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from .arguments import as_numbers, checked_array, checked_number_or_array, checked_type, described
 from .camera import PinholeCamera
-from .errors import FactorError
+from .errors import FactorError, count_of
 from .motion import MotionModel, checked_model
 from .robust import RobustKernel
 
@@ -109,7 +109,7 @@ class Alignment:
         try:
             return self._some(index, each if each.ndim == 1 else each[index])
         except IndexError:
-            expected = f"positions of some of {len(self)} matches"
+            expected = f"positions of some of {count_of(len(self), 'match', 'matches')}"
             raise FactorError("index of take", described(index), expected) from None
 
     def of_one_image(self, index: slice | NDArray[np.intp], c_acceleration: FloatArray) -> Alignment:

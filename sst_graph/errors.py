@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sst_graph.factors.errors import SstGraphError, printable
+from sst_graph.factors.errors import SstGraphError, count_of, printable
 
 __all__ = [
     "CheckpointError",
@@ -13,6 +13,7 @@ __all__ = [
     "EstimationError",
     "MissingDependencyError",
     "SstGraphError",
+    "count_of",
     "printable",
 ]
 

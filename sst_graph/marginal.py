@@ -11,6 +11,7 @@ docs/reference/marginal.md shows how a C++ program rebuilds it from the JSON.
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError, EstimationError
-from sst_graph.factors.arguments import checked_array, checked_gtsam, checked_number, checked_type
+from sst_graph.factors.arguments import checked_array, checked_gtsam, checked_number, checked_type, described
 from sst_graph.factors.custom.variables import checked_keys
 from sst_graph.factors.errors import FactorError
 from sst_graph.files.checked_values import checked_pose
@@ -41,6 +42,13 @@ EXTRINSIC = int(gtsam.symbol("E", 0))
 TIME_OFFSET = int(gtsam.symbol("D", 0))
 """Default key of the time offset (``Vector(1)``)."""
 
+SCAN_HASHES = "scan_hashes"
+"""Key of the hashes of scans in a marginal's file, and in the diagnostics of a result."""
+MOST_SCAN_HASHES = 32
+"""Hashes that a result keeps of its scans."""
+_MOST_FUSED = 1_000_000
+_HASH = re.compile("[0-9a-f]{16}")
+
 _ORDER = ["rot_x_rad", "rot_y_rad", "rot_z_rad", "trans_x_m", "trans_y_m", "trans_z_m", "time_offset_s"]
 
 
@@ -53,6 +61,8 @@ class CalibrationMarginal(ByValue):
         information: (7, 7) symmetric; positive semi-definite but for a part of a tracker's frames.
         vector: (7,) information times the optimum's d; zero where the point is the optimum.
         constant: twice the cost at d = 0.
+        scan_hashes: of some of the scans behind it, by which data that are counted twice are found; empty
+            where they are not known.
 
     Raises:
         FactorError: other types or shapes, values NaN or inf, or an information that is not symmetric.
@@ -64,6 +74,7 @@ class CalibrationMarginal(ByValue):
     information: FloatArray
     vector: FloatArray
     constant: float = 0.0
+    scan_hashes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         of = "of CalibrationMarginal"
@@ -77,6 +88,7 @@ class CalibrationMarginal(ByValue):
             "information": information,
             "vector": checked_array(f"vector {of}", self.vector, (7,)),
             "constant": checked_number(f"constant {of}", self.constant),
+            "scan_hashes": _checked_hashes(f"scan_hashes {of}", self.scan_hashes),
         }
         for name, value in plain.items():
             object.__setattr__(self, name, value)
@@ -136,6 +148,7 @@ class CalibrationMarginal(ByValue):
             information=self.information + there.information,
             vector=self.vector + there.vector,
             constant=self.constant + there.constant,
+            scan_hashes=tuple(sorted({*self.scan_hashes, *other.scan_hashes})),
         )
 
     def shares_point(self, other: CalibrationMarginal) -> bool:
@@ -167,6 +180,8 @@ class CalibrationMarginal(ByValue):
             "constant": self.constant,
             "gtsam_serialized": self.factor(E_key, D_key).serialize(),
         }
+        if self.scan_hashes:
+            document[SCAN_HASHES] = list(self.scan_hashes)
         return _dump(document)
 
     @staticmethod
@@ -184,6 +199,7 @@ class CalibrationMarginal(ByValue):
             _information(table),
             _bounded(table, "vector", table.matrix("vector", (7,))),
             float(_bounded(table, "constant", np.array(table.number("constant")))),
+            hashes_in(table),
         )
 
 
@@ -204,6 +220,27 @@ def read_marginal(path: str | Path) -> CalibrationMarginal:
         DataError: missing, unreadable or no such file.
     """
     return CalibrationMarginal.from_json(read_text(path, MARGINAL), path)
+
+
+def hashes_in(table: JsonTable) -> tuple[str, ...]:
+    """The hashes of scans in a file; none in one that does not have them.
+
+    Raises:
+        DataError: something else.
+    """
+    found = table.sequence(SCAN_HASHES) if SCAN_HASHES in table.data else []
+    if len(found) > _MOST_FUSED or not all(isinstance(one, str) and _HASH.fullmatch(one) for one in found):
+        raise DataError(f"{table.place}: {SCAN_HASHES}", "something else", "texts of 16 hexadecimal digits")
+    return tuple(found)
+
+
+def _checked_hashes(what: str, value: Any) -> tuple[str, ...]:
+    expected = "texts of 16 hexadecimal digits"
+    checked_type(what, value, (tuple, list), expected)
+    for one in value:
+        if not (isinstance(one, str) and _HASH.fullmatch(one)):
+            raise FactorError(what, described(one), expected)
+    return tuple(value)
 
 
 def _bounded(table: JsonTable, key: str, values: FloatArray) -> FloatArray:
@@ -255,7 +292,8 @@ def carried(marginal: CalibrationMarginal, cTl: gtsam.Pose3, time_offset_s: floa
     shift = np.append(step, time_offset_s - marginal.time_offset_s)
     L, g = marginal.information, marginal.vector
     constant = marginal.constant - 2.0 * float(g @ shift) + float(shift @ L @ shift)
-    return CalibrationMarginal(cTl, time_offset_s, J.T @ L @ J, J.T @ (g - L @ shift), constant)
+    vector = J.T @ (g - L @ shift)
+    return CalibrationMarginal(cTl, time_offset_s, J.T @ L @ J, vector, constant, marginal.scan_hashes)
 
 
 def _log(pose: gtsam.Pose3) -> tuple[FloatArray, FloatArray]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 from sst_graph.files.reading import TIMES_TXT, read_text
 
 NS_PER_S = 1_000_000_000
@@ -61,7 +61,7 @@ def read_times(path: Path) -> NDArray[np.int64]:
     """
     text = read_text(path, TIMES_TXT).rstrip()
     if text.count("\n") >= MAX_STAMPS:
-        raise DataError(path, f"{text.count(chr(10)) + 1} lines", f"at most {MAX_STAMPS} stamps")
+        raise DataError(path, count_of(text.count(chr(10)) + 1, "line"), f"at most {MAX_STAMPS} stamps")
     if not text:
         raise DataError(path, "no stamp", "one number of seconds a line")
     lines = text.splitlines()

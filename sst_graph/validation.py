@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 from sst_graph.factors.arguments import described, masked_values
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.files.checked_values import checked_pose, checked_time_offset_s, pinhole_camera
@@ -52,7 +52,7 @@ def checked_scan(scan: object, place: str = "scan", fewest: int = 1) -> Scan:
     points = _array(scan.points, (None, 3), f"{place}: points")
     n = len(points)
     if not fewest <= n <= MOST_POINTS:
-        raise DataError(f"{place}: points", f"{n} points", f"{fewest} to {MOST_POINTS}")
+        raise DataError(f"{place}: points", count_of(n, "point"), f"{fewest} to {MOST_POINTS}")
     points = _reals(points, FARTHEST_M, f"{place}: points", "m")
     classes = _labels(_array(scan.classes, (n,), f"{place}: classes"), f"{place}: classes")
     instances, rings = (
@@ -205,7 +205,7 @@ def _array(value: object, shape: tuple[int | None, ...], place: str, why: str = 
         wanted = f"({', '.join('n' if length is None else str(length) for length in shape)})"
         raise DataError(place, f"shape {value.shape}", f"{wanted}{f', {why}' if why else ''}")
     if (masked := masked_values(value)) > 0:
-        raise DataError(place, f"{masked} masked values", "an array without a mask: leave them out")
+        raise DataError(place, count_of(masked, "masked value"), "an array without a mask: leave them out")
     return np.asarray(value)
 
 

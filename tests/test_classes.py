@@ -76,7 +76,7 @@ def test_mask_keeps_its_shape_and_background_is_other() -> None:
 
 
 def test_id_read_as_train_id_is_refused() -> None:
-    with pytest.raises(DataError, match=r"label 26 \(1 times\), expected a Cityscapes trainids number"):
+    with pytest.raises(DataError, match=r"label 26 \(1 time\), expected a Cityscapes trainids number"):
         classes_of_mask(mask_of(0, 26), MaskEncoding.TRAIN_IDS)
 
 

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import ast
+import itertools
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from sst_graph.errors import count_of
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -53,3 +57,32 @@ def test_library_neither_prints_nor_exits(package: str) -> None:
             if isinstance(node, ast.Call) and ast.unparse(node.func) in ("print", "exit", "sys.exit"):
                 offenders.append(f"{path.relative_to(ROOT)}:{node.lineno}")
     assert offenders == []
+
+
+_COUNTED = re.compile(r" ([a-z]+ ){0,2}[a-z]{2,}s\b")
+_NO_NOUNS = re.compile(r" ([a-z]+ )?(is|was|has|as|its|times|in|more) ")
+
+
+@pytest.mark.parametrize("package", ["factors", "sst_graph"])
+def test_number_and_noun_agree(package: str) -> None:
+    """What is counted by len() is said by count_of: "1 pair", not "1 pairs"."""
+    offenders = []
+    for path in (ROOT / package).rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            parts = node.values if isinstance(node, ast.JoinedStr) else []
+            for number, words in itertools.pairwise(parts):
+                if not (isinstance(number, ast.FormattedValue) and isinstance(words, ast.Constant)):
+                    continue
+                said = _COUNTED.match(str(words.value))
+                if (
+                    ast.unparse(number.value).startswith("len(")
+                    and said
+                    and not _NO_NOUNS.match(said.group())
+                ):
+                    offenders.append(f"{path.relative_to(ROOT)}:{number.lineno}: {said.group()}")
+    assert offenders == []
+
+
+def test_counts_in_words() -> None:
+    assert [count_of(n, "pair") for n in (0, 1, 2)] == ["0 pairs", "1 pair", "2 pairs"]
+    assert [count_of(n, "match", "matches") for n in (1, 3)] == ["1 match", "3 matches"]

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arguments import checked_count, checked_type, described
-from ..errors import FactorError
+from ..errors import FactorError, count_of
 from .variables import Kind, Reader, checked_key, checked_keys, dimension, key_name
 
 FloatArray = NDArray[np.float64]
@@ -58,7 +58,7 @@ class FactorRecipe:
         checked_type(f"dims of {name}", self.dims, tuple, "one dimension or kind for each key")
         if len(self.dims) != len(self.keys):
             expected = f"{len(self.keys)}, one for each key"
-            raise FactorError(f"dims of {name}", f"{len(self.dims)} dims", expected)
+            raise FactorError(f"dims of {name}", count_of(len(self.dims), "dim"), expected)
         for kind in self.dims:
             dimension(kind)
         checked_count(f"rows of {name}", self.rows)
@@ -172,7 +172,8 @@ def _checked(
         raise FactorError(f"{what} {_names(keys)}", f"shape {array.shape}", f"shape {shape}")
     if not np.isfinite(array).all():
         what = f"{what} {_names(keys)}"
-        raise FactorError(what, f"{np.count_nonzero(~np.isfinite(array))} values NaN or inf", "finite values")
+        bad = count_of(int(np.count_nonzero(~np.isfinite(array))), "value")
+        raise FactorError(what, f"{bad} NaN or inf", "finite values")
     return array
 
 

@@ -43,8 +43,16 @@ from sst_graph.batch.total_covariance import total_covariance
 from sst_graph.config import expect_settings
 from sst_graph.covariance.considered import BUDGET
 from sst_graph.drive.geometric_labels import GeometricallyLabelled
-from sst_graph.drive.preparation import TRACK_INTERVAL_S, Drive, PrepareConfig, Progress, prepare_drive
+from sst_graph.drive.preparation import (
+    TRACK_INTERVAL_S,
+    Drive,
+    PrepareConfig,
+    Progress,
+    check_progress,
+    prepare_drive,
+)
 from sst_graph.errors import ConfigError, EstimationError
+from sst_graph.marginal import MOST_SCAN_HASHES, SCAN_HASHES
 from sst_graph.odometry.sweep import with_sweep
 from sst_graph.result import CalibrationResult
 from sst_graph.types import Guess, Source
@@ -75,7 +83,9 @@ def calibrate(
     Raises:
         DataError: the frames cannot be used.
         ConfigError: the settings contradict each other or the data.
+        FactorError: ``progress`` cannot be called so.
     """
+    check_progress(progress)
     sources = as_sources(frames)
     initial, initial_time_offset_s = checked_guess(initial, initial_time_offset_s)
     config = with_method_for(expect_settings(config, CalibrationConfig), sources)
@@ -95,6 +105,7 @@ def prepare_drives(
 ) -> list[Drive]:
     """Read each source once, and keep what the method needs; image features are tracked only where they are
     needed."""
+    check_progress(progress)
     config = with_method_for(config, sources)
     prepare = preparation_of(config)
     with_lower_edges = config.method in ("joint", "both") and config.lower_edges != "never"
@@ -127,6 +138,7 @@ def calibrate_prepared(
     progress: Progress | None = None,
 ) -> CalibrationResult:
     """:func:`calibrate` of drives from :func:`prepare_drives`, with the same settings."""
+    check_progress(progress)
     config = with_method_of(config or CalibrationConfig(), drives)
     guess = Guess(initial, initial_time_offset_s)
     method = _METHODS[config.method]
@@ -150,7 +162,16 @@ def finished(
     left_out = {drive.name: drive.left_out.counts() for drive in drives if drive.left_out.counts()}
     if left_out:
         diagnostics["left_out"] = left_out
+    if hashes := scan_hashes(drives):
+        diagnostics[SCAN_HASHES] = hashes
     return replace(result, diagnostics=diagnostics), estimate
+
+
+def scan_hashes(drives: Sequence[Drive]) -> list[str]:
+    """Of the drives' scans, the smallest ones: drives with a good part of their scans in common have some of
+    these in common."""
+    known = [drive.statistics.scan_hashes() for drive in drives if drive.statistics is not None]
+    return sorted(set().union(*known))[:MOST_SCAN_HASHES]
 
 
 def _check(sources: Sequence[Source], config: CalibrationConfig) -> None:

@@ -12,6 +12,7 @@ from sst_graph.batch.assumption_tests import estimated_report
 from sst_graph.batch.lower_edges import WithLowerEdges
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.drive.preparation import Drive
+from sst_graph.errors import count_of
 from sst_graph.fit import Fit, Profile
 from sst_graph.graph.outer_loop import JointSolution, agreement, concentration, explained, poor_fit
 from sst_graph.graph.state import difference
@@ -110,7 +111,7 @@ def fit_of(
 
 def _moving(solution: JointSolution) -> Iterator[str]:
     if not solution.converged:
-        yield f"the outer loop still moved after {solution.outer_iterations} iterations"
+        yield f"the outer loop still moved after {count_of(solution.outer_iterations, 'iteration')}"
 
 
 def _little_agreement(

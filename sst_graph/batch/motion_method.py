@@ -10,6 +10,7 @@ from sst_graph.batch.by_edges.problem import problem_of_some_frames, with_fewer_
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import MethodEstimate
 from sst_graph.drive.preparation import Drive, Progress
+from sst_graph.errors import count_of
 from sst_graph.fit import Fit
 from sst_graph.graph.state import difference
 from sst_graph.hand_eye.solution import MotionSolution, alternative, solve_motion
@@ -74,7 +75,7 @@ def _reasons(solutions: Sequence[MotionSolution]) -> tuple[str, ...]:
     best = solutions[0]
     reasons = []
     if not best.converged:
-        reasons.append(f"the outer loop still moved after {best.outer_iterations} iterations")
+        reasons.append(f"the outer loop still moved after {count_of(best.outer_iterations, 'iteration')}")
     other = alternative(solutions)
     if other is not None:
         step = difference(best.state, other.state)

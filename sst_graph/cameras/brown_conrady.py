@@ -26,7 +26,7 @@ from sst_graph.cameras.model import (
     FloatArray,
     smallest_positive_root,
 )
-from sst_graph.errors import ConfigError
+from sst_graph.errors import ConfigError, count_of
 
 _NAMES = {0: "pinhole", 4: "plumb_bob", 5: "plumb_bob", 8: "rational_polynomial", 12: "thin_prism"}
 _WIDEST = np.tan(np.deg2rad(89.5))
@@ -50,7 +50,7 @@ class BrownConradyCamera(CameraModel):
 
     def __post_init__(self) -> None:
         if len(self.coefficients) not in _NAMES:
-            found = f"{len(self.coefficients)} distortion coefficients"
+            found = count_of(len(self.coefficients), "distortion coefficient")
             raise ConfigError(f"camera: found {found}, expected 0, 4, 5, 8 or 12")
         if not (np.abs(self.coefficients) <= LARGEST_COEFFICIENT).all():
             raise ConfigError(f"camera: found coefficients {self.coefficients}, expected finite numbers")

@@ -18,7 +18,7 @@ from sst_graph.cameras.brown_conrady import BrownConradyCamera
 from sst_graph.cameras.double_sphere import DoubleSphereCamera
 from sst_graph.cameras.fisheye import FisheyeCamera
 from sst_graph.cameras.model import LARGEST_COEFFICIENT, CameraModel
-from sst_graph.errors import ConfigError, DataError
+from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.files.checked_values import checked_camera, checked_pose, pinhole_camera
 
@@ -56,10 +56,12 @@ def camera_of(
         raise DataError(place, f"distortion coefficients {values}", expected)
     if name in _FISHEYE:
         if len(values) != 4:
-            raise DataError(place, f"{len(values)} coefficients of {distortion}", "4 (k1 k2 k3 k4)")
+            raise DataError(
+                place, f"{count_of(len(values), 'coefficient')} of {distortion}", "4 (k1 k2 k3 k4)"
+            )
         return FisheyeCamera(intrinsics, values)
     if name in _NONE and any(values):
-        found = f"{len(values)} distortion coefficients without the name of a model"
+        found = f"{count_of(len(values), 'distortion coefficient')} without the name of a model"
         raise DataError(place, found, f"one of {', '.join((*_BROWN_CONRADY, *_FISHEYE))}")
     if not any(values) and name in (*_NONE, *_BROWN_CONRADY):
         return BrownConradyCamera(intrinsics)
@@ -68,7 +70,7 @@ def camera_of(
         raise DataError(place, f"distortion model '{distortion}'", f"one of {known}")
     if len(values) not in _BROWN_CONRADY[name]:
         expected = " or ".join(map(str, _BROWN_CONRADY[name]))
-        raise DataError(place, f"{len(values)} coefficients of {distortion}", expected)
+        raise DataError(place, f"{count_of(len(values), 'coefficient')} of {distortion}", expected)
     if len(values) == 14 and any(values[12:]):
         raise DataError(place, f"a tilted sensor (tau = {values[12:]})", "at most 12 coefficients")
     return BrownConradyCamera(intrinsics, values[:12])
@@ -153,7 +155,7 @@ def _kalibr_camera(table: Table, place: str) -> KalibrCamera:
         raise DataError(place, f"camera model '{kind}'", f"{_KALIBR}: calibrate with one of these")
     if len(values) != own + 4:
         names = "[xi, alpha, fu, fv, pu, pv]" if own else "[fu, fv, pu, pv]"
-        raise DataError(place, f"{len(values)} intrinsics of {kind}", names)
+        raise DataError(place, f"{count_of(len(values), 'intrinsic')} of {kind}", names)
     fx, fy, cx, cy = (float(value) for value in values[own:])
     intrinsics = pinhole_camera((fx, fy, cx, cy), (width, height), place)
     model: CameraModel
@@ -296,7 +298,7 @@ def _numbers(values: object, place: str) -> FloatArray:
 def _matrix(values: object, shape: tuple[int, int], place: str) -> FloatArray:
     numbers = _numbers(values, place)
     if len(numbers) != shape[0] * shape[1]:
-        raise DataError(place, f"{len(numbers)} numbers", f"{shape[0] * shape[1]} of a {shape} matrix")
+        raise DataError(place, count_of(len(numbers), "number"), f"{shape[0] * shape[1]} of a {shape} matrix")
     return numbers.reshape(shape)
 
 

@@ -24,7 +24,7 @@ from sst_graph.classes.data_sets import (
     SEMANTIC_KITTI,
     ClassMap,
 )
-from sst_graph.errors import ConfigError, DataError
+from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.types import SemanticClass
 
 
@@ -81,7 +81,7 @@ def look_up(
     unknown = classes == _UNKNOWN
     if unknown.any():
         values, counts = np.unique(numbers[unknown], return_counts=True)
-        raise DataError(place, f"label {values[0]} ({counts[0]} times)", expected)
+        raise DataError(place, f"label {values[0]} ({count_of(counts[0], 'time')})", expected)
     return classes
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sst_graph.cli.drive_motion import DriveMotion
 from sst_graph.data.frame_parts import RecentReader, image_positions, scan_positions
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 from sst_graph.fit import MatchedFrame
 from sst_graph.odometry.lidar import lidar_odometry
 from sst_graph.report.drawn_frame import DrawnFrame
@@ -39,7 +39,7 @@ def position_of(drive: RecentReader, index: int) -> int:
     for position in range(len(drive)):
         if drive.number(position) == index:
             return position
-    raise DataError(drive.source.name, f"no frame {index}", f"one of its {len(drive)} frames")
+    raise DataError(drive.source.name, f"no frame {index}", f"one of its {count_of(len(drive), 'frame')}")
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from sst_graph.cli.outputs import (
 from sst_graph.cli.progress import ProgressBar
 from sst_graph.cli.reading import options_of, warn_of_other_pairs, with_image_topic
 from sst_graph.cli.video import video_of, videos_beside
-from sst_graph.errors import ConfigError
+from sst_graph.errors import ConfigError, count_of
 from sst_graph.files import atomic_directory
 from sst_graph.files.strict_json import strict_json
 from sst_graph.inspect.report import Comparison, summary
@@ -246,7 +246,7 @@ def _sigmas(args: argparse.Namespace) -> tuple[float, float]:
 
 def rig_lines(rig: RigResult) -> list[tuple[str, str]]:
     """The rig in a few lines: status, poses between cameras with sigmas, what contradicts what."""
-    rows = [("rig", f"{rig.status}, {len(rig.cameras)} cameras")]
+    rows = [("rig", f"{rig.status}, {count_of(len(rig.cameras), 'camera')}")]
     rows += [
         ("" if k else "camera poses", _pose_line(p)) for k, p in enumerate(rig.marginal().relative_poses())
     ]

@@ -13,7 +13,7 @@ from sst_graph.config.old_names import with_new_names
 from sst_graph.config.ranges import Range
 from sst_graph.config.settings import join, settings_fields
 from sst_graph.config.values import checked, printable, shown
-from sst_graph.errors import ConfigError, DataError, SstGraphError
+from sst_graph.errors import ConfigError, DataError, SstGraphError, count_of
 from sst_graph.files.reading import SETTINGS, read_json, read_toml
 
 T = TypeVar("T")
@@ -88,7 +88,7 @@ def _parsed(name: str, text: str) -> Any:
     except json.JSONDecodeError:
         return text
     except (ValueError, RecursionError):  # integers of thousands of digits, lists nested thousands deep
-        found = f"{shown(text)} of {len(text)} characters"
+        found = f"{shown(text)} of {count_of(len(text), 'character')}"
         raise ConfigError(f"{printable(name)}: found {found}, expected a value of a few") from None
 
 

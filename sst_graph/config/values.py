@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
 from sst_graph.config.ranges import Range
-from sst_graph.errors import ConfigError
+from sst_graph.errors import ConfigError, count_of
 
 
 def checked(hint: Any, value: Any, place: str, limits: Range) -> Any:
@@ -61,7 +61,7 @@ def _checked_sequence(hint: Any, value: Any, place: str, limits: Range) -> Any:
         fewest, most = limits.length or (0, len(value))
         hints = [arguments[0]] * len(value)
     if not fewest <= len(value) <= most:
-        number = f"{fewest} values" if fewest == most else f"{fewest} to {most} values"
+        number = count_of(fewest, "value") if fewest == most else f"{fewest} to {count_of(most, 'value')}"
         raise mismatch(place, value, f"a list of {number}")
     items = [
         checked(hint, item, f"{place}[{i}]", limits)

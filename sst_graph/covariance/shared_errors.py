@@ -35,8 +35,9 @@ class SharedErrors:
     def cross_covariance(self, other: SharedErrors) -> FloatArray:
         """(7, 7) covariance with another camera's estimate."""
         cross = spread_covariance(self.samples, other.samples)
-        for name in self.common.keys() & other.common.keys():
-            cross += np.outer(self.common[name], other.common[name])
+        for name, step in self.common.items():  # a set's order of texts would differ from run to run
+            if name in other.common:
+                cross += np.outer(step, other.common[name])
         return cross
 
 

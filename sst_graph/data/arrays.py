@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 from sst_graph.files.reading import FileKind, read_file
 from sst_graph.validation import FARTHEST_M
 
@@ -109,7 +109,8 @@ def read_offsets(path: Path, used: NDArray[np.bool_]) -> NDArray[np.float32]:
     _check_count(path, len(offsets), len(used), "times")
     bad = np.flatnonzero(used & ~(np.abs(offsets) <= 1.0))
     if len(bad):
-        found = f"{len(bad)} times that are NaN or beyond 1 s, first at index {bad[0]}"
+        times = count_of(len(bad), "time that is", "times that are")
+        found = f"{times} NaN or beyond 1 s, first at index {bad[0]}"
         raise DataError(path, found, "seconds relative to the scan's stamp")
     return offsets
 
@@ -117,7 +118,7 @@ def read_offsets(path: Path, used: NDArray[np.bool_]) -> NDArray[np.float32]:
 def _values(data: bytes, path: Path, dtype: str, columns: int, expected: str) -> NDArray[Any]:
     size = np.dtype(dtype).itemsize * columns
     if len(data) % size:
-        raise DataError(path, f"{len(data)} bytes", f"a multiple of {size} ({expected})")
+        raise DataError(path, count_of(len(data), "byte"), f"a multiple of {size} ({expected})")
     return np.frombuffer(data, dtype)
 
 

@@ -9,7 +9,7 @@ import struct
 from dataclasses import dataclass
 from pathlib import Path
 
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 
 TIFF = (b"II*\0", b"MM\0*")
 
@@ -44,7 +44,7 @@ def tiff_size(data: bytes, path: str | Path) -> tuple[int, int]:
     directory = _directory(data, path)
     bits, channels = set(directory.entries.get(_BITS, (1,))), directory.one(_CHANNELS, "channels", 1)
     if not bits <= {8, 16} or not 1 <= channels <= 4:
-        found = f"{channels} channels of {'/'.join(map(str, sorted(bits)))} bits"
+        found = f"{count_of(channels, 'channel')} of {'/'.join(map(str, sorted(bits)))} bits"
         raise DataError(path, found, "1 to 4 channels of 8 or 16 bits")
     return directory.one(_WIDTH, "width"), directory.one(_HEIGHT, "height")
 
@@ -59,7 +59,9 @@ def check_tiff_whole(data: bytes, path: str | Path) -> None:
     starts = entries.get(_STRIPS) or entries.get(_TILES) or ()
     sizes = entries.get(_STRIP_BYTES) or entries.get(_TILE_BYTES) or ()
     if not starts or len(starts) != len(sizes):
-        raise DataError(path, f"{len(starts)} strips with {len(sizes)} sizes", "one size a strip")
+        raise DataError(
+            path, f"{count_of(len(starts), 'strip')} with {count_of(len(sizes), 'size')}", "one size a strip"
+        )
     if max(start + size for start, size in zip(starts, sizes, strict=True)) > len(data):
         raise DataError(path, f"a TIFF file truncated at byte {len(data)}", "all strips of its pixels")
 

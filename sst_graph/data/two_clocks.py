@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sst_graph.data.info.facts import SensorFacts, SourceFacts
 from sst_graph.data.source import SourceOptions, Sweep
-from sst_graph.errors import ConfigError, DataError
+from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.sweep_timing import SweepStamp
 from sst_graph.timestamps import check_rising
@@ -254,7 +254,7 @@ def _shifted(images: Sensor[CameraImage], shift: int) -> tuple[Sensor[CameraImag
     """
     count = len(images) - abs(shift)
     if count < 1:
-        raise ConfigError(f"image shift {shift}: the drive has {len(images)} images")
+        raise ConfigError(f"image shift {shift}: the drive has {count_of(len(images), 'image')}")
     first = max(0, -shift)
     stamps = images.stamps_ns[first : first + count]
     real = images.stamps_ns[first + shift : first + shift + count]

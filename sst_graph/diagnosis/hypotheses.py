@@ -26,6 +26,7 @@ from sst_graph.diagnosis.fit import (
 )
 from sst_graph.diagnosis.poses import start_finding
 from sst_graph.drive.preparation import Drive, ScanFeatures
+from sst_graph.errors import count_of
 from sst_graph.types import Guess
 
 FloatArray = NDArray[np.float64]
@@ -106,7 +107,8 @@ def _shifts(drive: Drive, guess: Guess) -> Iterator[Hypothesis]:
         for sign in (1.0, -1.0):
             shift_s = sign * window * _WINDOW_S
             finding = Finding(
-                f"the images' numbers or stamps are off by {round(abs(shift_s) / period)} frames or so",
+                "the images' numbers or stamps are off by "
+                f"{count_of(round(abs(shift_s) / period), 'frame')} or so",
                 "",
                 "compare the first frames of both sensors, or give --image-shift",
             )

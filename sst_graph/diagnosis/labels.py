@@ -8,6 +8,7 @@ from sst_graph.diagnosis.finding import Finding
 from sst_graph.diagnosis.units import FLAT, usual_ground
 from sst_graph.drive.input_statistics import InputStatistics
 from sst_graph.drive.preparation import Drive
+from sst_graph.errors import count_of
 from sst_graph.features.mask_shift import MaskShift, mask_shift
 from sst_graph.types import SemanticClass
 
@@ -93,7 +94,7 @@ def shifted_masks(found: MaskShift | None) -> Finding | None:
     way = ("right" if amount > 0.0 else "left") if sideways else ("down" if amount > 0.0 else "up")
     return Finding(
         f"the masks are shifted {way} against their pictures",
-        f"by {abs(amount):.1f} +- {sigma:.1f} px, along the contours of {found.objects} objects",
+        f"by {abs(amount):.1f} +- {sigma:.1f} px, along the contours of {count_of(found.objects, 'object')}",
         "look for a crop, a resize or a padding that only one of them went through",
     )
 
@@ -104,7 +105,8 @@ def foreign_masks(found: MaskShift | None) -> Finding | None:
         return None
     return Finding(
         "the masks are not those of these pictures (another drive, another order or numbering)",
-        f"the pictures show no more edges along the contours of {found.objects} objects than beside them",
+        f"the pictures show no more edges along the contours of {count_of(found.objects, 'object')} "
+        "than beside them",
         "lay a mask over the picture of the same number",
     )
 

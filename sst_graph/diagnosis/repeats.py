@@ -10,6 +10,7 @@ import numpy as np
 
 from sst_graph.diagnosis.finding import Finding
 from sst_graph.drive.preparation import Drive
+from sst_graph.errors import count_of
 
 _LEAST, _LEAST_SHARE = 3, 0.1
 """Equal frames in a row, or frames equal to the one before them and their share of the drive: a doubled one
@@ -67,7 +68,7 @@ def shared_scans(drives: Sequence[Drive]) -> Finding | None:
         if a & b:
             return Finding(
                 "the same scans are given twice",
-                f"{len(a & b)} scans of {one.name} are in {other.name}, too, to the last bit",
+                f"{other.name} has {count_of(len(a & b), 'scan')} of {one.name}, too, to the last bit",
                 "give each frame once: counted twice it makes the sigmas too small",
             )
     return None

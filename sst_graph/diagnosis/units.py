@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sst_graph.diagnosis.finding import Finding
 from sst_graph.drive.input_statistics import Ground, InputStatistics
 from sst_graph.drive.preparation import Drive
+from sst_graph.errors import count_of
 
 FloatArray = NDArray[np.float64]
 
@@ -47,7 +48,7 @@ def clouds(drive: Drive) -> Finding | None:
     if middle <= 0.0:
         return Finding(
             "the points labelled vehicle have no height",
-            f"median of {len(heights)} vehicles: {middle:.3g}",
+            f"median of {count_of(len(heights), 'vehicle')}: {middle:.3g}",
             "look at the column z of the clouds, then at the class numbers of the labels",
         )
     scale = middle / _CAR_HEIGHT_M

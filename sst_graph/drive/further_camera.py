@@ -23,7 +23,7 @@ from sst_graph.drive.preparation import (
     ScanFeatures,
     image_features,
 )
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 from sst_graph.files.array_store import ArrayStore
 from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.relative import relative_pose
@@ -51,7 +51,7 @@ def with_camera(
     numbers = _scan_numbers(drive, source)
     images, pairs, left_out, seen = _images(source, classes, config, progress)
     if not images:
-        raise DataError(source.name, f"no image in {len(source)} frames", "scans and images")
+        raise DataError(source.name, f"no image in {count_of(len(source), 'frame')}", "scans and images")
     scans = tuple(replace(scan, index=number) for scan, number in zip(drive.scans, numbers, strict=True))
     for_scans = drive.left_out
     left_out = replace(
@@ -121,9 +121,9 @@ def _scan_numbers(drive: Drive, source: Source) -> list[int]:
         known = {scan.index for scan in drive.scans}
         kept = [(p, n) for p, n in zip(positions, numbers, strict=True) if n in known]
         positions, numbers = [p for p, _ in kept], [n for _, n in kept]
-    expected = f"the {len(drive.scans)} scans of {drive.name}, as the first camera has them"
+    expected = f"the {count_of(len(drive.scans), 'scan')} of {drive.name}, as the first camera has them"
     if len(numbers) != len(drive.scans):
-        raise DataError(source.name, f"{len(numbers)} scans", expected)
+        raise DataError(source.name, count_of(len(numbers), "scan"), expected)
     for at in (0, -1):
         scan = scan_at(source, positions[at])
         if scan is None or scan.stamp_ns != drive.scans[at].stamp_ns:

@@ -5,6 +5,7 @@ Everything here is in the data's own units and axes, so that wrong units and wro
 
 from __future__ import annotations
 
+import hashlib
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -80,6 +81,12 @@ class ScanStatistics:
     vehicle_heights: FloatArray = field(default_factory=lambda: np.zeros(0))
     sample: NDArray[np.uint64] = field(default_factory=lambda: np.zeros(0, np.uint64))
 
+    def hash(self) -> str:
+        """Of its points: 16 hexadecimal digits, the same wherever the scan is read."""
+        own = hashlib.blake2b(self.digest.to_bytes(4, "little"), digest_size=8)
+        own.update(self.sample.astype("<u8").tobytes())
+        return own.hexdigest()
+
 
 @dataclass(frozen=True)
 class ImageStatistics:
@@ -109,6 +116,10 @@ class InputStatistics:
 
     scans: tuple[ScanStatistics, ...]
     images: tuple[ImageStatistics, ...]
+
+    def scan_hashes(self) -> set[str]:
+        """Hashes of the scans' points, 16 hexadecimal digits each; scans without points have none."""
+        return {scan.hash() for scan in self.scans if scan.digest}
 
 
 class StatisticsCollector:

@@ -16,7 +16,8 @@ from sst_graph.data.frame_parts import NumberedFrames
 from sst_graph.drive.geometric_labels import labelled_by_geometry
 from sst_graph.drive.input_statistics import InputStatistics, StatisticsCollector
 from sst_graph.drive.trajectory import GrowingTrack, TwistTrack
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
+from sst_graph.factors.arguments import checked_callback
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.lidar_edges import MAX_RANGE_M, Boundaries, Edge, find_boundaries
 from sst_graph.features.mask_contour import ContourMap
@@ -36,6 +37,15 @@ _LOG = logging.getLogger(__name__)
 FloatArray = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 """Called with (stage, steps done, steps in all)."""
+
+
+def check_progress(progress: object) -> None:
+    """Refuse what cannot be called as a :data:`Progress`; None is none.
+
+    Raises:
+        FactorError: it cannot.
+    """
+    checked_callback("progress", progress, ("stage", "done", "total"))
 
 
 SAMPLE_POINTS = 3000
@@ -219,7 +229,11 @@ class LeftOut:
         )
 
     def __str__(self) -> str:
-        return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in self.counts().items())
+        found = []
+        for name, count in self.counts().items():
+            what, *without = name.split("_")
+            found.append(" ".join([count_of(count, what.removesuffix("s")), *without]))
+        return ", ".join(found)
 
 
 @dataclass(frozen=True)
@@ -350,7 +364,7 @@ def prepare_drive(
             progress(f"reading {source.name}", position + 1, total)
     if not scans or not images:
         missing = "scan" if not scans else "image"
-        raise DataError(source.name, f"no {missing} in {total} frames", "scans and images")
+        raise DataError(source.name, f"no {missing} in {count_of(total, 'frame')}", "scans and images")
     if left_out.counts():
         surprising = left_out.in_part(len(scans), len(images)).counts()
         _LOG.log(logging.WARNING if surprising else logging.INFO, "%s: left out: %s", source.name, left_out)

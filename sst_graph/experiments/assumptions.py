@@ -14,7 +14,7 @@ from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drive
 from sst_graph.config import Settings, setting
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import Progress
-from sst_graph.errors import ConfigError
+from sst_graph.errors import ConfigError, count_of
 from sst_graph.experiments.wrong_drives import WRONG, with_line_delay
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
 
@@ -254,7 +254,8 @@ def _summary(runs: Sequence[Run], sigmas: Mapping[tuple[int, str], float]) -> li
     groups = {f"sizes above {_TOLD_SIGMAS:g} σ": large, "all sizes": broken}
     groups |= {case: [one for one in runs if one.case == case] for case in (CLEAN, DRAWN)}
     return [
-        f"- {name}: {len(some)} runs, {sum(bool(one.contradicted) for one in some)} contradicted, "
+        f"- {name}: {count_of(len(some), 'run')}, {sum(bool(one.contradicted) for one in some)} "
+        "contradicted, "
         f"{sum(one.status != 'ok' for one in some)} not ok, {sum(one.silent for one in some)} silent"
         for name, some in groups.items()
         if some

@@ -17,7 +17,7 @@ from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drive
 from sst_graph.config import Settings, setting
 from sst_graph.data import open_source
 from sst_graph.drive.preparation import Progress
-from sst_graph.errors import ConfigError
+from sst_graph.errors import ConfigError, count_of
 from sst_graph.experiments.resumable import Work, rows_of
 from sst_graph.metrics import calibration_errors
 from sst_graph.simulator import SimulationConfig, simulate
@@ -75,7 +75,7 @@ class BasinConfig(Settings):
         if not len(self.searches_deg) == len(self.searches_m) == len(self.starts):
             raise ConfigError(
                 f"searches_deg, searches_m, starts: found {len(self.searches_deg)}, {len(self.searches_m)} "
-                f"and {len(self.starts)} values, expected as many of each"
+                f"and {count_of(len(self.starts), 'value')}, expected as many of each"
             )
 
 
@@ -215,7 +215,11 @@ def binomial_bounds(count: int, of: int, confidence: float = _CONFIDENCE) -> tup
 def markdown(config: BasinConfig, runs: Sequence[BasinRun]) -> str:
     """The table of runs, a row for every search and distance of the start."""
     names = dict.fromkeys(row.drive for row in runs)
-    over = ", ".join(names) if config.data else f"{len(names)} simulated streets (seeds from {config.seed})"
+    over = (
+        ", ".join(names)
+        if config.data
+        else f"{count_of(len(names), 'simulated street')} (seeds from {config.seed})"
+    )
     lines = [
         f"{over}; starts uniform over rotations within {config.start_deg:g}° of the truth and within "
         f"±{config.start_m:g} m by axis. Failed: QAD above {config.failed_deg:g}° or ATD above "

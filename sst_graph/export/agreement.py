@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from sst_graph.covariance.contradiction import Difference, PartEstimate, combined, name_step
-from sst_graph.errors import ContradictionError, EstimationError
+from sst_graph.errors import ContradictionError, EstimationError, count_of
 from sst_graph.graph.linear import unit_scale
+from sst_graph.marginal import CalibrationMarginal
 
 FloatArray = NDArray[np.float64]
 
@@ -60,10 +61,33 @@ def check_agreement(
     if 2.0 * p_value < significance:
         name = repr(names[worst]) if names else f"number {worst}"
         raise ContradictionError(
-            f"{len(parts)} marginals contradict one another (chi-squared {chi2:.0f} of {freedom}): {name} "
+            f"{count_of(len(parts), 'marginal')} contradict one another (chi-squared {chi2:.0f} of "
+            f"{freedom}): {name} "
             f"differs from the others in {name_step(against[worst], cTl).sentence}; fuse what was recorded "
             "with one mount and one clock, or give significance=0 to fuse all the same"
         )
+
+
+def check_apart(marginals: Sequence[CalibrationMarginal], names: Sequence[str] = ()) -> None:
+    """That no two are of the same scans, which counted twice make the fused result too sure.
+
+    Two are where they have scans in common, or where their numbers are the same to the last bit.
+
+    Raises:
+        EstimationError: two are.
+    """
+    owners: dict[str | bytes, int] = {}
+    for k, one in enumerate(marginals):
+        numbers = (one.cTl.matrix(), np.array(one.time_offset_s), one.information, one.vector)
+        own: list[str | bytes] = [*one.scan_hashes, b"".join(array.tobytes() for array in numbers)]
+        known = [owners[mark] for mark in own if mark in owners]
+        if known:
+            first, second = (repr(names[i]) if names else f"number {i}" for i in (known[0], k))
+            raise EstimationError(
+                f"marginals {first} and {second} are of the same scans: counted twice these make the fused "
+                "result too sure; give each drive once, or significance=0 to fuse all the same"
+            )
+        owners.update(dict.fromkeys(own, k))
 
 
 def _check_answers(informations: Sequence[FloatArray], names: Sequence[str]) -> None:

@@ -30,7 +30,10 @@ FORMATS: dict[str, Callable[[Rig], str]] = {
 """Writers by the name of the format."""
 
 _EITHER_WAY = ("ros-tf", "ros1-launch", "ros2-launch", "ros2-launch-xml", "urdf", "xacro")
-_IN_A_VEHICLE = (*_EITHER_WAY, "autoware", "kalibr", "openvins", "mins", "nuscenes")
+_WITH_LINKS = (*_EITHER_WAY, "autoware")
+_CHAINS = ("kalibr", "openvins", "mins")
+_IN_A_VEHICLE = (*_WITH_LINKS, *_CHAINS, "nuscenes")
+_WITH_OPTICAL_FRAMES = (*_WITH_LINKS, *_CHAINS, "opencv")
 
 
 def export_text(
@@ -45,7 +48,11 @@ def export_text(
     if target not in FORMATS:
         raise ConfigError(f"export format {target!r}: expected one of {', '.join(FORMATS)}")
     options = options or ExportOptions()
+    lidar_frame = None if options.lidar_frame == ExportOptions().lidar_frame else options.lidar_frame
     for name, value, formats in (
+        ("--camera-frame", options.camera_frame, _WITH_OPTICAL_FRAMES),
+        ("--camera-link", options.camera_link, _WITH_LINKS),
+        ("--lidar-frame", lidar_frame, (*_WITH_OPTICAL_FRAMES, "nuscenes")),
         ("--calib", options.kitti, ("kitti",)),
         ("--child", options.child, _EITHER_WAY),
         ("--parent", options.parent, _IN_A_VEHICLE),

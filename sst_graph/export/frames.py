@@ -93,7 +93,8 @@ class Rig:
         """What a tree of frames needs: each camera's transform, and its optical frame below its link.
 
         Raises:
-            ConfigError: frames that are not known, or both of one side; a LiDAR below several cameras.
+            ConfigError: frames that are not known, or both of one side; a link that is named and at no end; a
+                LiDAR below several cameras.
         """
         self.check_tree()
         found: list[StaticTransform] = []
@@ -101,6 +102,12 @@ class Rig:
             parent, child = self._ends(name, number)
             found.append(StaticTransform(parent, child, self._pose(name, parent, child)))
             frames = self.frames[name]
+            if self.options.camera_link is not None and frames.link not in (parent, child):
+                raise ConfigError(
+                    f"--camera-link {self.options.camera_link} would change nothing: expected the link "
+                    "at one "
+                    "end, by --parent or --child"
+                )
             if frames.link in (parent, child) and self._known_link(name) is None:
                 found.append(StaticTransform(frames.link, frames.optical, self.link_from_optical(name)))
         children = [one.child for one in found]

@@ -16,13 +16,14 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.errors import EstimationError
-from sst_graph.export.agreement import SIGNIFICANCE, check_agreement
+from sst_graph.errors import EstimationError, count_of
+from sst_graph.export.agreement import SIGNIFICANCE, check_agreement, check_apart
 from sst_graph.factors.arguments import checked_type
 from sst_graph.factors.errors import FactorError
 from sst_graph.marginal import (
     EXTRINSIC,
     FORMAT,
+    SCAN_HASHES,
     TIME_OFFSET,
     VERSION,
     CalibrationMarginal,
@@ -64,7 +65,10 @@ def marginal_of_result(result: CalibrationResult) -> CalibrationMarginal:
     """
     checked_type("result", result, CalibrationResult, "a CalibrationResult")
     information = _inverse(result.covariance, "covariance of the result")
-    return CalibrationMarginal(result.T_camera_lidar, result.time_offset_s, information, np.zeros(7))
+    hashes = result.diagnostics.get(SCAN_HASHES, ())
+    return CalibrationMarginal(
+        result.T_camera_lidar, result.time_offset_s, information, np.zeros(7), scan_hashes=hashes
+    )
 
 
 def marginal_of_graph(
@@ -191,7 +195,7 @@ def fuse_graphs(
 
     Raises:
         ContradictionError: the drives contradict one another.
-        EstimationError: a direction that no drive determines, or no convergence.
+        EstimationError: a direction that no drive determines, no convergence, or two equal graphs.
         FactorError: no pairs of a graph and its values.
     """
     expected = "pairs of a NonlinearFactorGraph and its Values"
@@ -199,7 +203,7 @@ def fuse_graphs(
     for pair in graphs:
         checked_type("graphs", pair, (list, tuple), expected)
         if len(pair) != 2:
-            raise FactorError("graphs", f"{len(pair)} objects", expected)
+            raise FactorError("graphs", count_of(len(pair), "object"), expected)
     parts = [marginal_of_graph(graph, values, E_key, D_key) for graph, values in graphs]
     fused = fuse_marginals(parts, significance=significance)
     for _ in range(max_rounds):
@@ -209,7 +213,9 @@ def fuse_graphs(
         step = np.append(fused.cTl.localCoordinates(point.cTl), fused.time_offset_s - point.time_offset_s)
         if np.sqrt(step @ fused.information @ step) < tolerance_sigmas:
             return fused, parts
-    raise EstimationError(f"fusion of {len(graphs)} drives: still moving after {max_rounds} rounds")
+    raise EstimationError(
+        f"fusion of {count_of(len(graphs), 'drive')}: still moving after {count_of(max_rounds, 'round')}"
+    )
 
 
 def fuse_marginals(
@@ -233,7 +239,7 @@ def fuse_marginals(
     Raises:
         ContradictionError: they contradict one another; the message names the worst and its step.
         EstimationError: none given, a direction that none of them determines, one that takes information away
-            (to be added with ``significance=0``), or no optimum.
+            (to be added with ``significance=0``), no optimum, or two of the same scans.
         FactorError: no marginals.
     """
     checked_type("marginals", marginals, (list, tuple), "a list of CalibrationMarginal")
@@ -242,7 +248,11 @@ def fuse_marginals(
     if not marginals:
         raise EstimationError("no marginal to fuse")
     if names and len(names) != len(marginals):
-        raise EstimationError(f"found {len(names)} names, expected {len(marginals)}, one a marginal")
+        raise EstimationError(
+            f"found {count_of(len(names), 'name')}, expected {len(marginals)}, one a marginal"
+        )
+    if significance > 0.0:
+        check_apart(marginals, names)
     fused = marginals[0]
     for _ in range(_MAX_ROUNDS):
         parts = [_carried(marginal, fused.cTl, fused.time_offset_s) for marginal in marginals]
@@ -252,6 +262,7 @@ def fuse_marginals(
             sum((part.information for part in parts), np.zeros((7, 7))),
             sum((part.vector for part in parts), np.zeros(7)),
             sum(part.constant for part in parts),
+            tuple(sorted({one for part in parts for one in part.scan_hashes})),
         )
         step = total.covariance() @ total.vector
         fused = _carried(total, *total.best())
@@ -259,7 +270,7 @@ def fuse_marginals(
             break
     else:
         raise EstimationError(
-            f"fusion of {len(marginals)} marginals: still moving after {_MAX_ROUNDS} rounds"
+            f"fusion of {count_of(len(marginals), 'marginal')}: still moving after {_MAX_ROUNDS} rounds"
         )
     check_agreement([(part.information, part.vector) for part in parts], fused.cTl, names, significance)
     return fused

@@ -20,6 +20,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.errors import count_of
+
 _LOG = logging.getLogger(__name__)
 _T = TypeVar("_T")
 
@@ -96,7 +98,7 @@ class ArrayStore:
         view, got = flat.view(np.uint8).data, 0
         while got < len(view):
             if not (count := _read_at(self._file.fileno(), view[got:], start + got)):
-                raise OSError(f"the temporary file of a drive ends {len(view) - got} bytes early")
+                raise OSError(f"the temporary file of a drive ends {count_of(len(view) - got, 'byte')} early")
             got += count
         return flat.reshape(shape)
 

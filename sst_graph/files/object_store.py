@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from sst_graph.errors import count_of
 from sst_graph.files.typed_values import wrong_fields
 
 Node = Any
@@ -460,7 +461,7 @@ class _Reader:
         if packed:
             data = zlib.decompressobj().decompress(data, size + 1)
         if len(data) != size:
-            raise ValueError(f"{len(data)} bytes of an array of {size}")
+            raise ValueError(f"{count_of(len(data), 'byte')} of an array of {size}")
         flat = np.frombuffer(data, kind).copy()
         return self._keep(number, flat.reshape(shape, order="F" if order == "F" else "C"))
 
@@ -482,7 +483,7 @@ class _Reader:
 
     def _deque(self, nodes: list[Node], most: int | None, number: int) -> deque[Any]:
         if most is not None and not (type(most) is int and len(nodes) <= most):
-            raise ValueError(f"{len(nodes)} entries of at most {most!r:.60}")
+            raise ValueError(f"{count_of(len(nodes), 'entry', 'entries')} of at most {most!r:.60}")
         found: deque[Any] = self._keep(number, deque(maxlen=most))
         found.extend(self.value(node) for node in nodes)
         return found

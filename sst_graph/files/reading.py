@@ -22,7 +22,7 @@ from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 from sst_graph.factors.arguments import described
 
 MAX_DEPTH = 64
@@ -229,13 +229,13 @@ def _check_text(text: str) -> None:
 
 def _whole_number(text: str) -> int:
     if len(text) > MAX_DIGITS + 1:
-        raise ValueError(f"a whole number of {len(text)} characters")
+        raise ValueError(f"a whole number of {count_of(len(text), 'character')}")
     return int(text)
 
 
 def _finite_number(text: str) -> float:
     if len(text) > MAX_NUMBER_LENGTH:
-        raise ValueError(f"a number of {len(text)} characters")
+        raise ValueError(f"a number of {count_of(len(text), 'character')}")
     number = float(text)
     if not math.isfinite(number):
         raise ValueError(f"the number {text} is not finite")

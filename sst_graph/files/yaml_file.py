@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from sst_graph.errors import DataError, MissingDependencyError
+from sst_graph.errors import DataError, MissingDependencyError, count_of
 from sst_graph.files.reading import FileKind, read_text
 
 YAML = FileKind("a YAML file", 64 * 1024)
@@ -100,5 +100,5 @@ def numbers(value: Any, place: str, count: int | None = None) -> list[float]:
     for item in value:
         flat.extend(item if isinstance(item, list) else [item])
     if count is not None and len(flat) != count:
-        raise DataError(place, f"{len(flat)} numbers", f"{count}")
+        raise DataError(place, count_of(len(flat), "number"), f"{count}")
     return [number(item, place) for item in flat]

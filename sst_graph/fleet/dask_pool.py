@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import Any
 
-from sst_graph.errors import ConfigError, MissingDependencyError
+from sst_graph.errors import ConfigError, MissingDependencyError, count_of
 from sst_graph.fleet.attempt import Job
 from sst_graph.fleet.record import Record
 
@@ -89,7 +89,8 @@ def run_on_dask(
                 continue
             except CancelledError:
                 raise ConfigError(
-                    f"--dask {cluster.address}: lost the scheduler with {len(running)} drives at it; "
+                    f"--dask {cluster.address}: lost the scheduler with "
+                    f"{count_of(len(running), 'drive')} at it; "
                     "the same command goes on from here, on this one or another"
                 ) from None
             for future, found in outcomes.items():

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
-from sst_graph.errors import ConfigError, DataError
+from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.fleet.places import Place
 
 _NOT_IN_A_NAME = re.compile(r"[^A-Za-z0-9._=+-]+")
@@ -82,7 +82,7 @@ def find_drives(what: str, name_parts: int = 1) -> list[Drive]:
     if not drives:
         raise ConfigError(f"{what}: found no drive, expected at least one")
     if len(drives) > MOST_DRIVES:
-        raise ConfigError(f"{what}: found {len(drives)} drives, expected at most {MOST_DRIVES}")
+        raise ConfigError(f"{what}: found {count_of(len(drives), 'drive')}, expected at most {MOST_DRIVES}")
     _check_names(drives)
     return drives
 
@@ -106,7 +106,9 @@ def with_vehicles(drives: Sequence[Drive], given: str) -> list[Drive]:
         date = _checked_date(row.get("date") or drive.date, given)
         found.append(replace(drive, vehicle=(row.get("vehicle") or drive.vehicle).strip(), date=date))
     if not any(drive.vehicle for drive in found):
-        raise ConfigError(f"--vehicle-from {given}: found no vehicle of any of {len(found)} drives")
+        raise ConfigError(
+            f"--vehicle-from {given}: found no vehicle of any of {count_of(len(found), 'drive')}"
+        )
     return found
 
 

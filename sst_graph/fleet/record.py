@@ -15,7 +15,7 @@ from sst_graph.files.json_table import json_table
 from sst_graph.files.reading import FileKind, parse_json
 from sst_graph.files.strict_json import strict_json
 from sst_graph.inspect.reasons import short_reasons
-from sst_graph.marginal import CalibrationMarginal, inverse
+from sst_graph.marginal import SCAN_HASHES, CalibrationMarginal, hashes_in, inverse
 from sst_graph.result import CalibrationResult
 
 FloatArray = NDArray[np.float64]
@@ -83,6 +83,7 @@ class Numbers:
         common: columns of 7, one an assumption: what its deviation (one sigma) shifts the result by.
         frames: how many took part.
         camera: name of the camera.
+        scan_hashes: of some of its scans.
     """
 
     T_camera_lidar: list[list[float]]
@@ -91,6 +92,7 @@ class Numbers:
     common: list[list[float]]
     frames: int
     camera: str
+    scan_hashes: tuple[str, ...] = ()
 
     @staticmethod
     def of(result: CalibrationResult) -> Numbers:
@@ -102,6 +104,7 @@ class Numbers:
             _common(result.diagnostics.get("assumptions")),
             len(result.frames_used),
             result.camera_name,
+            tuple(result.diagnostics.get(SCAN_HASHES, ())),
         )
 
     @property
@@ -117,7 +120,9 @@ class Numbers:
         """
         information = inverse(np.array(self.covariance), "covariance of the result")
         cTl = gtsam.Pose3(np.array(self.T_camera_lidar))
-        return CalibrationMarginal(cTl, self.time_offset_s, information, np.zeros(7))
+        return CalibrationMarginal(
+            cTl, self.time_offset_s, information, np.zeros(7), scan_hashes=self.scan_hashes
+        )
 
 
 @dataclass(frozen=True)
@@ -179,6 +184,7 @@ class Record:
                 else [],
                 read.integer("frames"),
                 read.text("camera"),
+                hashes_in(read),
             )
         spent = Cost(
             cost.integer("attempts"),

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from sst_graph.config import Settings, internal
 from sst_graph.drive.preparation import Drive, Progress
-from sst_graph.errors import EstimationError
+from sst_graph.errors import EstimationError, count_of
 from sst_graph.factors import residuals
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.fit import OuterIteration
@@ -316,8 +316,14 @@ def _seen(solution: JointSolution) -> int:
 
 
 def _check_matches(matches: int, pairs: int, config: JointConfig) -> None:
-    if matches < config.min_matches:
+    if matches >= config.min_matches:
+        return
+    expected = f"expected {config.min_matches} or more"
+    if not matches:
         raise EstimationError(
-            f"{matches} silhouette matches in {pairs} pairs of scan and image, "
-            f"expected {config.min_matches} or more"
+            f"no silhouette matches, {expected}: no boundary point of a scan is near a contour of its "
+            "class in "
+            "the image of its time"
         )
+    found = count_of(matches, "silhouette match", "silhouette matches")
+    raise EstimationError(f"{found} in {count_of(pairs, 'pair')} of scan and image, {expected}")

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sst_graph.drive.path import SensorPath
 from sst_graph.drive.preparation import Drive, Progress
-from sst_graph.errors import EstimationError
+from sst_graph.errors import EstimationError, count_of
 from sst_graph.fit import OuterIteration
 from sst_graph.graph.convergence import STEP_SIGMAS, step_share
 from sst_graph.graph.state import EXTRINSIC, State, difference, time_offset_key
@@ -202,7 +202,8 @@ def _information(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Flo
 
 def _too_few(pairs: int) -> str:
     return (
-        f"{pairs} pairs of camera and LiDAR motion over the same time, expected {MIN_PAIRS} or more: "
+        f"{count_of(pairs, 'pair')} of camera and LiDAR motion over the same time, expected {MIN_PAIRS} "
+        "or more: "
         "motion alone needs consecutive frames of a moving vehicle"
     )
 

@@ -48,6 +48,7 @@ def read_chain(document: Document, options: ImportOptions) -> Found:
 
     Raises:
         DataError: several cameras and none named, no pose, or no pose of the LiDAR in the IMU's place.
+        ConfigError: frames are named that change nothing.
     """
     table = document.yaml
     name, entry = _chosen(cameras_of(table), options, document)
@@ -61,12 +62,14 @@ def read_chain(document: Document, options: ImportOptions) -> Found:
     lidar = _lidar(table)
     if lidar is not None:
         lidar_name, lidar_entry = lidar
+        options.check_effect((), f"{document.path} has the pose of {lidar_name} in the IMU")
         at = f"{document.path}: {lidar_name}"
         of_lidar = _seconds(lidar_entry, "timeoffset", at) or 0.0
         shift = None if shift is None else shift - of_lidar
         cTl = cTi * _pose(lidar_entry, "T_imu_lidar", at)
         return Found(cTl, shift, f"{said}, T_imu_lidar of {lidar_name}")
     if options.parent is None:
+        options.check_effect((), "without --parent the LiDAR is in the IMU's place")
         return Found(cTi, shift, f"{said}: the LiDAR in the IMU's place")
     return Found(cTi * _in_tree(options, document), shift, f"{said}: {options.parent} in the IMU's place")
 

@@ -10,7 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 from sst_graph.files.reading import CALIBRATION, FileKind, parse_json, read_text
 from sst_graph.files.yaml_file import YAML, parse_yaml
 
@@ -93,7 +93,9 @@ class Document:
     def _check_length(self, language: str) -> None:
         most = _MOST_CHARACTERS[language]
         if len(self.text) > most:
-            raise DataError(self.path, f"{language} of {len(self.text)} characters", f"at most {most}")
+            raise DataError(
+                self.path, f"{language} of {count_of(len(self.text), 'character')}", f"at most {most}"
+            )
 
 
 def read_document(path: Path, kind: FileKind = ANY) -> Document:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -70,6 +70,23 @@ class ImportOptions:
                 f"--camera-frame {self.camera_frame} and --camera-link {self.camera_link}: found both, "
                 "expected the optical frame (z forward) or the link (x forward)"
             )
+
+    def check_effect(self, allowed: Collection[str], why: str) -> None:
+        """Refuse frames that are named in vain.
+
+        Args:
+            allowed: names of the fields that have an effect.
+            why: the others have none, in words.
+
+        Raises:
+            ConfigError: another one is given.
+        """
+        for name in _FRAME_FIELDS:
+            if name not in allowed and getattr(self, name) is not None:
+                raise ConfigError(f"--{name.replace('_', '-')} would change nothing: {why}")
+
+
+_FRAME_FIELDS = ("camera_frame", "camera_link", "lidar_frame", "parent", "tree")
 
 
 def extrinsic_between(

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import gtsam
 
 from sst_graph.data.ros.transforms import Transforms
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 from sst_graph.files.yaml_file import number
 from sst_graph.imports.document import Document
 from sst_graph.imports.rotations import pose_by_quaternion, pose_by_rpy
@@ -96,7 +96,7 @@ def _by_position(words: Sequence[str], place: str) -> tuple[str, str, gtsam.Pose
     """x y z qx qy qz qw parent child, or x y z yaw pitch roll parent child."""
     if len(words) not in (8, 9):
         expected = "x y z qx qy qz qw parent child, x y z yaw pitch roll parent child, or flags"
-        raise DataError(place, f"{len(words)} arguments", expected)
+        raise DataError(place, count_of(len(words), "argument"), expected)
     *values, parent, child = words
     numbers = [number(word, place) for word in values]
     xyz, rotation = numbers[:3], numbers[3:]

@@ -57,7 +57,8 @@ def import_calibration(
 
     Raises:
         DataError: missing or unreadable, no known format or several, no calibration of one camera.
-        ConfigError: an unknown format, or a camera whose name the format cannot have.
+        ConfigError: an unknown format, a camera whose name the format cannot have, or frames that change
+            nothing in it.
         EstimationError: a marginal that leaves a direction open.
         MissingDependencyError: a YAML file, and PyYAML is not installed.
     """
@@ -67,7 +68,15 @@ def import_calibration(
         path = file
     document = read_document(path)
     form = recognized(document, form)
-    return FORMATS[form](document, options or ImportOptions(), form)
+    options = options or ImportOptions()
+    options.check_effect(_FRAMES.get(form, ()), f"{path} is of the format {form}, which {_frames_of(form)}")
+    return FORMATS[form](document, options, form)
+
+
+def _frames_of(form: str) -> str:
+    """What a format says of the options for frames."""
+    known = ", ".join(f"--{name.replace('_', '-')}" for name in _FRAMES.get(form, ()))
+    return f"has only {known}" if known else "names no frames"
 
 
 def read_tree(path: Path) -> Transforms:
@@ -184,6 +193,13 @@ _TREES: dict[str, Callable[[Document], Transforms]] = {
     "xacro": urdf.joints,
     "autoware": tables.sensor_kit,
 }
+
+_FRAMES: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(_TREES, ("camera_frame", "camera_link", "lidar_frame", "tree")),
+    **dict.fromkeys(("kalibr", "openvins", "mins"), ("parent", "lidar_frame", "tree")),
+    "nuscenes": ("lidar_frame",),
+}
+"""Options for frames that a format has a use for; formats that are not here name no frames."""
 
 FORMATS: dict[str, _Reader] = {
     "calibration": _by(records.read_own),

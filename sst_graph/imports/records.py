@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 
 from sst_graph.data.nuscenes.tables import pose_of
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 from sst_graph.files.checked_values import checked_pose, checked_time_offset_s
 from sst_graph.files.json_table import JsonTable
 from sst_graph.files.yaml_file import number, numbers
@@ -120,18 +120,27 @@ def read_nuscenes(document: Document, options: ImportOptions) -> Found:
     """Records of ``calibrated_sensor``: poses of camera and LiDAR in the ego frame, rotation w x y z.
 
     Raises:
-        DataError: several cameras or LiDARs and none named, or no pose.
+        DataError: several cameras or LiDARs and none named, none of the name, or no pose.
     """
     records = document.json
     cameras = [record for record in records if record.get("camera_intrinsic")]
     lidars = [record for record in records if not record.get("camera_intrinsic")]
     camera = _record(cameras, options.camera, document, "camera")
-    lidar = _record(lidars, options.lidar_frame, document, "LiDAR")
+    lidar = _record(_named_lidar(lidars, options.lidar_frame, document), None, document, "LiDAR")
     cTl = pose_of(camera, document.path).inverse() * pose_of(lidar, document.path)
     table = JsonTable(camera, str(document.path))
     known = camera.get("time_offset_s") is not None
     time_offset_s = table.time_offset_s("time_offset_s") if known else None
     return Found(cTl, time_offset_s, f"{_channel(camera)} and {_channel(lidar)} in the ego frame")
+
+
+def _named_lidar(records: list[Any], channel: str | None, document: Document) -> list[Any]:
+    """Those of a channel; all without one."""
+    named = [record for record in records if channel in (None, _channel(record))]
+    if records and not named:
+        listed = ", ".join(map(_channel, records[:12]))
+        raise DataError(document.path, f"the LiDARs {listed}", f"one named {channel:.60} (--lidar-frame)")
+    return named
 
 
 def _record(records: list[Any], name: str | None, document: Document, what: str) -> Any:
@@ -143,7 +152,9 @@ def _record(records: list[Any], name: str | None, document: Document, what: str)
     if len(records) != 1:
         channels = ", ".join(map(_channel, records[:12]))
         option = "--camera NAME" if what == "camera" else "--lidar-frame NAME"
-        raise DataError(document.path, f"{len(records)} records of a {what} ({channels})", f"one: {option}")
+        raise DataError(
+            document.path, f"{count_of(len(records), 'record')} of a {what} ({channels})", f"one: {option}"
+        )
     return records[0]
 
 

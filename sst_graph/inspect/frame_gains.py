@@ -25,6 +25,7 @@ from sst_graph.covariance.error_model import ErrorModel, fit_error_model
 from sst_graph.covariance.match_table import MatchTable
 from sst_graph.covariance.sums import ScoreSums, total
 from sst_graph.drive.preparation import Drive
+from sst_graph.errors import count_of
 from sst_graph.graph.elimination import Unknowns
 from sst_graph.graph.linear import information_inverse
 from sst_graph.graph.matching import PairMatches
@@ -191,7 +192,7 @@ def _frame_information(
         keys = list(factor.keys())
         twists = [key for key in keys if key not in known]
         if len(twists) > 1:
-            raise ValueError(f"a factor on {len(twists)} twists: frames are no longer separate")
+            raise ValueError(f"a factor on {count_of(len(twists), 'twist')}: frames are no longer separate")
         columns = np.concatenate([_columns(key, unknowns) for key in keys])
         if twists:
             terms.setdefault(twists[0], []).append((columns, factor.augmentedInformation()))

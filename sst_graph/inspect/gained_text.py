@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sst_graph.errors import count_of
 from sst_graph.inspect.gained import Gain, Gained
 from sst_graph.inspect.inspection import HUMAN, UNITS
 from sst_graph.result import CalibrationResult
@@ -64,8 +65,8 @@ def _arrivals(gains: Sequence[Gain], all_frames: bool) -> list[str]:
         order = np.argsort(-bits_of, kind="stable")
         needed = int(np.searchsorted(np.cumsum(bits_of[order]), 0.5 * total)) + 1
         lines.append(
-            f"- {total:.1f} bits since scan {gains[0].frame.frame}, half of them from {needed} of "
-            f"{len(gains)} scans"
+            f"- {total:.1f} bits since scan {gains[0].frame.frame}, half of them from "
+            f"{needed} of {count_of(len(gains), 'scan')}"
         )
     return [
         *lines,

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.errors import count_of
 from sst_graph.inspect.budget_text import budget_lines
 from sst_graph.inspect.frame_information import FrameInformation
 from sst_graph.inspect.gained_text import MOST_FRAMES, SHORT, gained_lines, short
@@ -82,8 +83,8 @@ def advice_sentences(inspection: Inspection, plan: Plan) -> list[str]:
     best, now = plan.best, plan.now
     axes = np.argsort(-np.abs(inspection.weakest.vector))[:2]
     sentences = [
-        f"record {plan.count} frames {best.name}, each at another place: {_changes(now, best, axes)}; "
-        + _status_after(best, plan.count, now)
+        f"record {count_of(plan.count, 'frame')} {best.name}, each at another place: "
+        f"{_changes(now, best, axes)}; " + _status_after(best, plan.count, now)
     ]
     sentences.append(f"the same with objects half as far: {_changes(best, plan.nearer, axes)}")
     views = plan.views
@@ -107,7 +108,8 @@ def _elsewhere(inspection: Inspection, plan: Plan) -> str | None:
     if lost[axes[0]] < 1.2:
         return None
     return (
-        f"other places beat more frames of this one: the same {len(inspection.frames)} frames, each at "
+        "other places beat more frames of this one: the same "
+        f"{count_of(len(inspection.frames), 'frame')}, each at "
         f"another place, would have given {_values(plan.elsewhere, axes)} instead of "
         f"{_values(plan.now, axes)}; "
         "the outlines of the same objects err again and again"
@@ -160,7 +162,8 @@ def _correlation_block(inspection: Inspection) -> list[str]:
     lines += [f"- {correlation_sentence(pair)}" for pair in inspection.strong[:MOST_SENTENCES]]
     if (more := len(inspection.strong) - MOST_SENTENCES) > 0:
         lines.append(
-            f"- {more} more pairs of {inspection.strong[-1].value:+.2f} and stronger (--json has them)"
+            f"- {count_of(more, 'more pair')} of {inspection.strong[-1].value:+.2f} and stronger "
+            "(--json has them)"
         )
     return lines
 
@@ -217,7 +220,8 @@ def _frame_block(inspection: Inspection, all_frames: bool) -> list[str]:
 
 def _plan_block(inspection: Inspection, plan: Plan) -> list[str]:
     lines = [
-        f"what to record next: sigmas predicted for {plan.count} more frames, each at another place, with "
+        f"what to record next: sigmas predicted for {count_of(plan.count, 'more frame')}, each at "
+        "another place, with "
         "the record's average view",
         f"{'':<38}" + "".join(f"{name:>8}" for name in SHORT) + f"{'of limit':>10}{'bits':>7}{'enough':>8}",
         f"{'':<38}" + "".join(f"{unit:>8}" for unit in UNITS) + f"{'':>10}{'':>7}{'frames':>8}",
@@ -253,7 +257,7 @@ def _growth(ratio: float) -> str:
 
 
 def _such(count: int) -> str:
-    return "1 such frame" if count == 1 else f"{count} such frames"
+    return count_of(count, "such frame")
 
 
 def _changes(before: Prediction, after: Prediction, axes: NDArray[np.intp]) -> str:

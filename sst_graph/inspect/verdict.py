@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.errors import count_of
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.fit import CLOSE_PX, EDGES_QUALITY, FitQuality
 from sst_graph.inspect.pixels import cP_H_cTl, pixel_covariance
@@ -76,7 +77,8 @@ def quality_line(quality: FitQuality) -> str:
     others = {"at the start": quality.share_at_start, "at random rotations": quality.by_chance}
     shares = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in others.items() if share is not None)
     return (
-        f"{100.0 * quality.share:.0f} % of {quality.points} boundary points within {CLOSE_PX:g} px of the "
+        f"{100.0 * quality.share:.0f} % of {count_of(quality.points, 'boundary point')} within "
+        f"{CLOSE_PX:g} px of the "
         f"{'contour' if by_labels else 'strongest edge nearby'}{f' ({shares})' if shares else ''}"
         # What edges allow falls with the calibration itself: it would not tell one that is wrong.
         + (f"; labels like these allow {100.0 * quality.attainable:.0f} %" if by_labels else "")

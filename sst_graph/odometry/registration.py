@@ -15,7 +15,7 @@ import numpy as np
 import small_gicp
 from numpy.typing import NDArray
 
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 from sst_graph.odometry.cloud import FEWEST_POINTS, registration_cloud, usable_points
 from sst_graph.odometry.lidar import (
     FAILED_M,
@@ -159,5 +159,7 @@ def _cloud(scan: Scan) -> small_gicp.PointCloud:
     if np.count_nonzero(static) >= _MIN_POINTS:
         points = points[static]
     if len(points) < _NEIGHBOURS:
-        raise DataError("scan to register", f"{len(points)} points in range", f"{_NEIGHBOURS} or more")
+        raise DataError(
+            "scan to register", f"{count_of(len(points), 'point')} in range", f"{_NEIGHBOURS} or more"
+        )
     return registration_cloud(points, _VOXEL_M, _NEIGHBOURS, PLANE_RATIO)

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.errors import count_of
 from sst_graph.factors import residuals
 from sst_graph.factors.matches import Alignment
 from sst_graph.features.mask_contour import ContourMap
@@ -180,7 +181,8 @@ def _close_up(
     )
     column, row = (0.5 * np.array([crop.left + crop.right, crop.top + crop.bottom])).astype(int)
     caption = (
-        f"{size:.1f} px from the {'edges' if by_edges else 'contour'} (median of {len(r)} points; {sides}), "
+        f"{size:.1f} px from the {'edges' if by_edges else 'contour'} (median of "
+        f"{count_of(len(r), 'point')}; {sides}), "
         f"{100.0 * np.mean(np.abs(r) < CLOSE_PX):.0f} % within {CLOSE_PX:g} px. ±2 sigma of the calibration "
         f"moves it by ±{reach:.1f} px. {information}"
         f"{drawn.frame.drive}, image {drawn.frame.image}, about column {column}, row {row}."

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.errors import count_of
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.fit import CLOSE_PX, Fit, PointResiduals
 from sst_graph.report.chart import Chart
@@ -141,7 +142,9 @@ def _by_object(fit: Fit) -> str:
     ]
     order = np.argsort(middles)
     ranges = [float(np.median(np.linalg.norm(points.lPs[own], axis=1))) for own in groups]
-    titles = [f"{middles[k]:+.2f} px, {len(groups[k])} points, at {ranges[k]:.0f} m" for k in order]
+    titles = [
+        f"{middles[k]:+.2f} px, {count_of(len(groups[k]), 'point')}, at {ranges[k]:.0f} m" for k in order
+    ]
     most = max(1.0, float(np.abs(middles).max()))
     chart = Chart(
         (-0.5, len(groups) - 0.5),
@@ -157,7 +160,7 @@ def _by_object(fit: Fit) -> str:
     return figure(
         chart.svg(),
         "By object",
-        f"The {len(groups)} objects with the most points. "
+        f"The {count_of(len(groups), 'object')} with the most points. "
         + (
             "Points far off are weighed down. Most err by less than 1 px; an object far out moves, or has a "
             "strong edge beside its outline."
@@ -187,7 +190,7 @@ def _over_picture(fit: Fit, camera: PinholeCamera) -> str:
         shift = np.linalg.solve(H, n.T @ (w * points.residuals_px[own]))
         places.append(uvs[own].mean(axis=0))
         shifts.append(shift)
-        titles.append(f"{shift[0]:+.2f} px right, {shift[1]:+.2f} px down, {len(own)} points")
+        titles.append(f"{shift[0]:+.2f} px right, {shift[1]:+.2f} px down, {count_of(len(own), 'point')}")
     if not places:
         return ""
     at, by = np.array(places), np.array(shifts)

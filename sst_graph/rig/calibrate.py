@@ -28,7 +28,7 @@ from sst_graph.config import expect_settings, to_dict
 from sst_graph.covariance.observability import open_directions
 from sst_graph.covariance.shared_errors import SharedErrors
 from sst_graph.drive.further_camera import with_camera
-from sst_graph.drive.preparation import Drive, Progress
+from sst_graph.drive.preparation import Drive, Progress, check_progress
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.factors.arguments import checked_type
 from sst_graph.fit import QUALITY, Fit
@@ -79,8 +79,9 @@ def calibrate_rig(
     Raises:
         DataError: the frames cannot be used, or two cameras have different scans.
         ConfigError: the settings contradict each other or the data.
-        FactorError: no dict of cameras or guesses, or nothing known of a rig.
+        FactorError: no dict of cameras or guesses, nothing known of a rig, or no such ``progress``.
     """
+    check_progress(progress)
     known = KnownRig() if known is None else known
     checked_type("cameras", cameras, Mapping, "a dict of sources by the camera's name")
     for name in cameras:

@@ -92,8 +92,9 @@ def _cross(one: CameraInfluences, other: CameraInfluences, correlations: Mapping
     cross += one.steps_without[a].T @ other.steps_without[b]
     a, b = _common(one.scans, other.scans)
     cross += np.einsum("fij,fkj->ik", one.motion[a], other.motion[b])
-    for name in one.assumptions.keys() & other.assumptions.keys():
-        cross += np.outer(one.assumptions[name], other.assumptions[name])
+    for name, step in one.assumptions.items():  # a set's order of texts would differ from run to run
+        if name in other.assumptions:
+            cross += np.outer(step, other.assumptions[name])
     return cross
 
 

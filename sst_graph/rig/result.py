@@ -16,7 +16,7 @@ from typing import Any, cast, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.errors import ConfigError, DataError
+from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.files.checked_values import check_covariance, check_finite
 from sst_graph.files.json_table import JsonTable, json_table
 from sst_graph.files.reading import FileKind, parse_json, path_of, read_text
@@ -192,7 +192,9 @@ def _names(table: JsonTable) -> tuple[str, ...]:
     names = tuple(camera.text("name") for camera in table.tables("cameras"))
     if not 1 <= len(names) <= _MOST_CAMERAS or len(set(names)) < len(names):
         raise DataError(
-            f"{table.place}: cameras", f"{len(names)} names", f"1 to {_MOST_CAMERAS}, each of them once"
+            f"{table.place}: cameras",
+            count_of(len(names), "name"),
+            f"1 to {_MOST_CAMERAS}, each of them once",
         )
     return names
 

@@ -18,7 +18,7 @@ from sst_graph.data.ros.images import picture_of
 from sst_graph.data.ros.topics import COMPRESSED, IMAGE
 from sst_graph.data.ros.transforms import Transforms
 from sst_graph.data.source import TURNS
-from sst_graph.errors import ConfigError, DataError
+from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.reference import load_initial
 from sst_graph.ros_node.published import WARN, Diagnosis, NodeMessages, Published, diagnosis_of
 from sst_graph.ros_node.sensor import SensorRecord
@@ -129,7 +129,9 @@ class CalibrationNode:
             "without_partner": self._unpaired,
         }
         level = WARN if self._queue.dropped else 0
-        found.append(Diagnosis("queue", level, f"{self._queue.dropped} messages dropped", waiting))
+        found.append(
+            Diagnosis("queue", level, f"{count_of(self._queue.dropped, 'message')} dropped", waiting)
+        )
         return Published(diagnostics=self._make.diagnostics(found, now_ns))
 
     def finish(self, now_ns: int) -> list[Published]:

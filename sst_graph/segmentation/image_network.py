@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 from sst_graph.segmentation.label_numbers import LabelNumbers
 from sst_graph.segmentation.onnx_network import OnnxNetwork
 from sst_graph.segmentation.picture_input import PictureInput, Placement, best_output
@@ -154,7 +154,8 @@ class OnnxImageSegmenter:
         if masks.ndim == 4 and masks.shape[1] == 1:
             masks = masks[:, 0]
         if masks.ndim != 3 or not len(scores) == len(labels) == len(masks):
-            found = f"{len(scores)} scores, {len(labels)} labels, masks of shape {masks.shape}"
+            counts = f"{count_of(len(scores), 'score')}, {count_of(len(labels), 'label')}"
+            found = f"{counts}, masks of shape {masks.shape}"
             raise DataError(self.model.network, found, "n scores, n labels, masks n x h x w or n x 1 x h x w")
         order = np.argsort(-scores, kind="stable")
         order = order[scores[order] >= self.model.min_score][:_MOST_INSTANCES]

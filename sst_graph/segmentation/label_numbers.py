@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.classes import ClassMap, class_map, class_table, look_up
-from sst_graph.errors import ConfigError, DataError
+from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.types import SemanticClass
 
 MAX_NUMBER = 0xFFFF
@@ -52,15 +52,19 @@ class LabelNumbers:
             DataError: another number of outputs than the data set has classes, or some that are not listed.
         """
         if self.outputs is not None and count != self.outputs:
-            raise DataError(place, f"{count} outputs a pixel", f"{self.outputs}, one a class of {self.name}")
+            raise DataError(
+                place, f"{count_of(count, 'output')} a pixel", f"{self.outputs}, one a class of {self.name}"
+            )
         missing = [k for k in range(count) if k not in self.classes]
         if missing and self.others is None:
-            found = f"{count} outputs a pixel, and no class for output {missing[0]}"
+            found = f"{count_of(count, 'output')} a pixel, and no class for output {missing[0]}"
             raise DataError(place, found, f"a class for each in {self.name}, or a class for {_OTHERS}")
         beyond = [k for k in self.classes if k >= count and k != 255]
         if beyond and self.outputs is None:
             raise DataError(
-                place, f"{count} outputs a pixel", f"more than {max(beyond)}, which {self.name} names"
+                place,
+                f"{count_of(count, 'output')} a pixel",
+                f"more than {max(beyond)}, which {self.name} names",
             )
         return np.array([int(self.classes.get(k, self.others)) for k in range(count)], np.uint8)  # type: ignore[arg-type]
 

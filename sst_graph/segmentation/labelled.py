@@ -14,6 +14,7 @@ import numpy as np
 from sst_graph.data.frame_parts import image_at, scan_at
 from sst_graph.data.source_view import SourceView
 from sst_graph.errors import ConfigError, DataError
+from sst_graph.factors.arguments import checked_callback
 from sst_graph.segmentation.segmenter import ImageLabels, ImageSegmenter, PointLabels, ScanSegmenter
 from sst_graph.segmentation.store import LabelStore, StoredModel, cache_folder
 from sst_graph.types import CameraImage, Frame, Scan, SemanticClass, Source
@@ -220,7 +221,9 @@ def segment_drive(drive: LabelledSource, progress: Callable[[int, int], None] | 
 
     Raises:
         DataError: a frame cannot be read or labelled; what was made before is stored.
+        FactorError: ``progress`` cannot be called so.
     """
+    checked_callback("progress", progress, ("done", "total"))
     before = Counter(drive.labelling.counts)
     for position in range(len(drive)):
         drive.read_image(position)

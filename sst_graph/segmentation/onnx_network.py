@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.errors import DataError, MissingDependencyError
+from sst_graph.errors import DataError, MissingDependencyError, count_of
 from sst_graph.files.reading import FileKind, digest_of_file
 from sst_graph.segmentation.label_numbers import LabelNumbers
 
@@ -54,7 +54,9 @@ class OnnxNetwork:
         inputs, self.outputs = _described(self._session, path)
         if len(inputs) != 1:
             named = ", ".join(name for name, _, _ in inputs)
-            raise DataError(path, f"{len(inputs)} inputs ({named})", "one, the picture or the range image")
+            raise DataError(
+                path, f"{count_of(len(inputs), 'input')} ({named})", "one, the picture or the range image"
+            )
         self._input, kind, shape = inputs[0]
         if kind not in _DTYPES:
             raise DataError(path, f"an input of {kind}", f"one of {', '.join(_DTYPES)}")

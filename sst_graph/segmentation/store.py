@@ -35,7 +35,7 @@ from sst_graph.classes import (
 )
 from sst_graph.data.arrays import listed, read_labels
 from sst_graph.data.images import read_instances, read_mask
-from sst_graph.errors import ConfigError, DataError
+from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.files import atomic_write_bytes, atomic_write_text
 from sst_graph.files.reading import FileKind, read_json
 from sst_graph.segmentation.segmenter import ImageLabels, PointLabels, Segmenter
@@ -100,7 +100,7 @@ class LabelStore:
             named = ", ".join(f"{one.name} ({one.identity[:_DIGITS]})" for one in models)
             option = "--image-model" if side == "images" else "--lidar-model"
             raise ConfigError(
-                f"{self.folder}: found labels of {len(models)} networks ({named}): give {option}"
+                f"{self.folder}: found labels of {count_of(len(models), 'network')} ({named}): give {option}"
             )
         return models[0] if models else None
 

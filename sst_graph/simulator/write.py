@@ -12,6 +12,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.factors.arguments import checked_callback
 from sst_graph.files import OutputKind, atomic_directory
 from sst_graph.simulator.drive import RawFrame, SimulatedDrive
 from sst_graph.simulator.rig import beside, with_mounts
@@ -58,6 +59,7 @@ def write_drive(
     Raises:
         ConfigError: ``path`` is there and may not be replaced.
         OSError: it cannot be written.
+        FactorError: ``progress`` cannot be called so.
     """
     with atomic_directory(path, overwrite, DRIVE) as root:
         fill_drive(drive, root, progress, stereo)
@@ -71,7 +73,9 @@ def fill_drive(
 
     Raises:
         OSError: it cannot be written.
+        FactorError: ``progress`` cannot be called so.
     """
+    checked_callback("progress", progress, ("done", "total"))
     folder = root / "sequences" / "00"
     right = right_camera(drive) if stereo else None
     more = (*(("velodyne_times",) if drive.config.gives_times else ()), *(RIGHT_FOLDERS if stereo else ()))

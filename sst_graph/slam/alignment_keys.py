@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 from sst_graph.factors.arguments import checked_type
 from sst_graph.factors.custom.variables import body_in_lidar, checked_key, number_or_key, pose_or_key
 from sst_graph.types import SemanticClass
@@ -47,7 +47,11 @@ class Trajectory:
         self._stamps: list[int] = []
         keys, stamps = list(keys), list(stamps_ns)
         if len(keys) != len(stamps):
-            raise DataError("Trajectory", f"{len(keys)} keys, {len(stamps)} stamps", "one stamp a key")
+            raise DataError(
+                "Trajectory",
+                f"{count_of(len(keys), 'key')}, {count_of(len(stamps), 'stamp')}",
+                "one stamp a key",
+            )
         for key, stamp_ns in zip(keys, stamps, strict=True):
             self.append(key, stamp_ns)
 

@@ -22,7 +22,7 @@ from sst_graph.association.edge_matching import MatchConfig
 from sst_graph.batch.by_edges.positions import position_columns
 from sst_graph.config import Settings, expect_settings, setting
 from sst_graph.drive.preparation import ImageFeatures, ScanFeatures
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 from sst_graph.factors.arguments import checked_type
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.factors.camera_motion import Between
@@ -161,7 +161,8 @@ class TermMatches:
 
     def __str__(self) -> str:
         outside = f", by {1e3 * abs(self.outside_s):.0f} ms" if self.outside_s else ""
-        return f"{self.state.value}{outside}: {len(self)} matches, kernel {self.kernel_px:.1f} px"
+        found = count_of(len(self), "match", "matches")
+        return f"{self.state.value}{outside}: {found}, kernel {self.kernel_px:.1f} px"
 
     def left_interval_s(self, values: gtsam.Values) -> float:
         """How far stamp + offset now lies outside of the two poses that the factor is on [s]; 0 within."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.drive.preparation import ScanFeatures
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 from sst_graph.factors.arguments import checked_gtsam, checked_type
 from sst_graph.objects.dynamic_objects import DynamicObjectTest
 from sst_graph.objects.occupancy import ObjectName
@@ -58,7 +58,7 @@ def follow_objects(
     for wTl in wTls:
         checked_gtsam("wTls of follow_objects", wTl, gtsam.Pose3)
     if len(scans) != len(wTls):
-        raise DataError("follow_objects", f"{len(wTls)} poses", f"{len(scans)}, one a scan")
+        raise DataError("follow_objects", count_of(len(wTls), "pose"), f"{len(scans)}, one a scan")
     tracker, test = ObjectTracker(), DynamicObjectTest()
     features = [scan_features_of(scan, classes) for scan in scans]
     for number, (each, wTl) in enumerate(zip(features, wTls, strict=True)):

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.config import expect_settings
-from sst_graph.errors import EstimationError
+from sst_graph.errors import EstimationError, count_of
 from sst_graph.factors.arguments import checked_type
 from sst_graph.factors.custom.variables import checked_problem
 from sst_graph.factors.priors import time_offset_prior
@@ -171,7 +171,7 @@ def match_all(
     matches = [term.matched(values, kernel_px, information) for term in terms]
     if all(each.factor is None for each in matches):
         states = ", ".join(sorted({each.state.value for each in matches}))
-        found = f"no factor in {len(terms)} terms ({states})"
+        found = f"no factor in {count_of(len(terms), 'term')} ({states})"
         raise EstimationError(f"alignment: found {found}, expected one or more")
     return matches
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.errors import count_of
 from sst_graph.inspect.inspection import HUMAN, NAMES, UNITS, Inspection
 from sst_graph.inspect.planning import AT_REST_MPS, Plan
 from sst_graph.viz.graph_plot import draw_graph
@@ -162,7 +163,7 @@ def draw_plan(figure: Any, plan: Plan) -> Any:
     ax.set_xlim(0.5 * min(0.5, *worst), 2.0 * max(2.0, *worst))
     ax.set_yticks(y, [prediction.name for prediction in predictions])
     ax.set_xlabel("sigma of the direction known worst, over its limit (left of 1: status ok)")
-    ax.set_title(f"What {plan.count} more frames at other places would bring", pad=16)
+    ax.set_title(f"What {count_of(plan.count, 'more frame')} at other places would bring", pad=16)
     return figure
 
 

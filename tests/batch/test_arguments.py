@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import gtsam
@@ -13,10 +15,14 @@ import numpy as np
 import pytest
 
 from checks.fuzz import STREET
-from sst_graph import CalibrationConfig, PinholeCamera, TrackerConfig, calibrate
+from sst_graph import CalibrationConfig, PinholeCamera, TrackerConfig, calibrate, calibrate_rig
+from sst_graph.batch.calibrate import calibrate_prepared, prepare_drives
 from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.drive.preparation import check_progress
 from sst_graph.errors import SstGraphError
-from sst_graph.simulator import simulate
+from sst_graph.factors import FactorError
+from sst_graph.segmentation.labelled import segment_drive
+from sst_graph.simulator import simulate, write_drive
 from sst_graph.types import Frame
 
 
@@ -98,3 +104,43 @@ def test_a_source_whose_frames_hold_anything(drive: KeptDrive, part: str, method
             drive.nominal,
             CalibrationConfig(method=method),
         )
+
+
+@pytest.mark.parametrize(
+    ("progress", "found"),
+    [
+        (3, "found 3"),
+        ("bar", "found the text 'bar'"),
+        (lambda: None, r"one with the arguments \(\)"),
+        (lambda stage, done: None, r"one with the arguments \(stage, done\)"),
+        (lambda stage, done, total, *, at: None, r"one with the arguments \(stage, done, total, \*, at\)"),
+    ],
+)
+def test_no_progress(progress: Any, found: str, drive: KeptDrive) -> None:
+    expected = "expected a function of (stage, done, total), or None"
+    for begin in (
+        lambda: calibrate(drive, progress=progress),
+        lambda: calibrate_rig({"left": drive}, progress=progress),
+        lambda: prepare_drives([drive], CalibrationConfig(), progress),
+        lambda: calibrate_prepared([], progress=progress),
+    ):
+        with pytest.raises(FactorError, match=f"progress: .*{found}") as error:
+            begin()
+        assert expected in str(error.value)
+
+
+def test_no_progress_of_files(tmp_path: Path) -> None:
+    wrong: Any = lambda done: None  # noqa: E731
+    with pytest.raises(FactorError, match=r"arguments \(done\), expected a function of \(done, total\)"):
+        write_drive(simulate(STREET), tmp_path / "street", progress=wrong)
+    assert not (tmp_path / "street").exists()
+    with pytest.raises(FactorError, match="progress: found 3"):
+        segment_drive([], 3)  # type: ignore[arg-type]
+
+
+def test_progress_of_any_kind() -> None:
+    """Bound methods, further arguments with defaults, and what is written in C."""
+    for progress in (lambda *step: None, lambda a, b, c, d=1: None, print):
+        check_progress(progress)
+    check_progress(None)
+    check_progress(functools.partial(lambda where, a, b, c: None, "here"))

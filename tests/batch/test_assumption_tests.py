@@ -155,7 +155,7 @@ def test_the_table_counts_what_was_found() -> None:
     assert "| k1 | 0.1 | 10.0 | 2 | 1 | 1 | 1 | 1 |" in text
     assert "| cx | 5 | 1.0 | 1 | 0 | 0 | 0 | 0 |" in text
     assert "- sizes above 5 σ: 2 runs, 1 contradicted, 1 not ok, 1 silent" in text
-    assert "- clean: 1 runs, 0 contradicted, 0 not ok, 0 silent" in text
+    assert "- clean: 1 run, 0 contradicted, 0 not ok, 0 silent" in text
 
 
 def test_rows_count_sizes_in_deviations_with_in_sigmas() -> None:

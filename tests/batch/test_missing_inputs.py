@@ -26,7 +26,7 @@ def test_a_drive_with_gaps_is_calibrated(tmp_path: Path, capsys: pytest.CaptureF
     assert main(["calibrate", str(tmp_path / "street"), "--out", str(out)]) == 3
     lines = capsys.readouterr().err.splitlines()
     warnings = [line for line in lines if "left out" in line]
-    assert len(warnings) == 1 and "1 images without mask, 1 images without picture" in warnings[0]
+    assert len(warnings) == 1 and "1 image without mask, 1 image without picture" in warnings[0]
     document = json.loads((out / "calibration.json").read_text())
     assert document["diagnostics"]["left_out"] == {
         "street/00": {

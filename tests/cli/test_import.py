@@ -16,6 +16,14 @@ from sst_graph.data import open_source
 from sst_graph.reference import load_initial
 
 RESULT = turned(3)
+CHAINS = ("kalibr", "openvins", "mins")
+MINS = """
+cam0: {T_imu_cam: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], timeoffset: 0}
+lidar0: {T_imu_lidar: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}
+"""
+NUSCENES = """[
+{"channel": "CAM_FRONT", "translation": [0, 0, 0], "rotation": [1, 0, 0, 0], "camera_intrinsic": [[1]]},
+{"channel": "LIDAR_TOP", "translation": [0, 0, 0], "rotation": [1, 0, 0, 0], "camera_intrinsic": []}]"""
 
 
 @pytest.fixture
@@ -103,6 +111,8 @@ def test_a_calibration_starts_from_a_file_of_another_program(
         ("cam0: {T_cam_imu: 1}", ["--camera-frame", "a", "--camera-link", "b"], "found both"),
         ("cam0: {T_cam_imu: 1}", ["--tree", "nowhere"], "nowhere: found no such file"),
         ("\x00", [], "no known format"),
+        (MINS, ["--parent", "imu"], "--parent would change nothing: {path} has the pose of lidar0"),
+        (NUSCENES, ["--lidar-frame", "LIDAR_REAR"], "found the LiDARs LIDAR_TOP, expected one named"),
     ],
 )
 def test_bad_usage(
@@ -113,4 +123,40 @@ def test_bad_usage(
         path.write_text(text)
     assert main(["import", str(path), *options]) == 2
     said = capsys.readouterr()
-    assert said.out == "" and said.err.count("\n") == 1 and message in said.err
+    assert said.out == "" and said.err.count("\n") == 1 and message.format(path=path) in said.err
+
+
+OPTIONS = {
+    "--camera-frame": "camera_optical_frame",
+    "--camera-link": "camera_link",
+    "--lidar-frame": "lidar",
+    "--parent": "lidar",
+    "--tree": "{tree}",
+}
+OF_TREES = ("--camera-frame", "--camera-link", "--lidar-frame", "--tree")
+WITH_EFFECT = {
+    **dict.fromkeys(("ros-tf", "ros1-launch", "ros2-launch", "ros2-launch-xml", "urdf", "xacro"), OF_TREES),
+    "autoware": OF_TREES,
+    "nuscenes": ("--lidar-frame",),
+}
+
+
+@pytest.mark.parametrize("target", ["calibration", *EXPORTS])
+def test_frames_that_change_nothing_are_refused(
+    target: str, result_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of camera chains --lidar-frame and --tree have an effect beside --parent alone."""
+    exported, tree = tmp_path / "exported", tmp_path / "robot.urdf"
+    assert main(["export", str(result_file), "--to", "urdf", "--out", str(tree)]) == 0
+    if target == "calibration":
+        exported = result_file
+    else:
+        assert main(["export", str(result_file), "--to", target, "--out", str(exported)]) == 0
+    for option, value in OPTIONS.items():
+        capsys.readouterr()
+        if option in WITH_EFFECT.get(target, ()) or (option == "--parent" and target in CHAINS):
+            continue
+        assert main(["import", str(exported), option, value.format(tree=tree)]) == 2
+        said = capsys.readouterr()
+        assert said.out == "" and said.err.count("\n") == 1
+        assert said.err.startswith(f"sst-graph: error: {option} would change nothing: ")

@@ -283,7 +283,7 @@ def test_missing_labels_masks_and_pictures_are_left_out_and_counted(
     }
     assert len(found.image_pairs) == len(found.images) - 1
     assert [record.getMessage() for record in caplog.records] == [
-        "kitti/00: left out: 1 scans without labels, 1 images without mask, 1 images without picture"
+        "kitti/00: left out: 1 scan without labels, 1 image without mask, 1 image without picture"
     ]
 
 

@@ -166,11 +166,11 @@ BROKEN = {
     "short.pcd": (pcd("binary", 2, TWELVE), "12 bytes of points, expected 24"),
     "many.pcd": (pcd("binary", MANY, TWELVE), "100000000 points"),
     "many-rows.pcd": (pcd("ascii", 0, b"", POINTS="1" + "0" * 30), "points, expected 0 to"),
-    "lines.pcd": (pcd("ascii", 2, b"1 2 3\n"), "1 lines of points, expected 2"),
+    "lines.pcd": (pcd("ascii", 2, b"1 2 3\n"), "1 line of points, expected 2"),
     "words.pcd": (pcd("ascii", 1, b"1 2 three\n"), "points that are no numbers"),
     "columns.pcd": (pcd("ascii", 1, b"1 2\n"), "points that are no numbers"),
     "type.pcd": (pcd("binary", 1, TWELVE, TYPE="F F C"), "field z of type C"),
-    "counts.pcd": (pcd("binary", 1, TWELVE, SIZE="4 4"), "3 fields, 3 types, 2 sizes"),
+    "counts.pcd": (pcd("binary", 1, TWELVE, SIZE="4 4"), "3 FIELDS, 3 TYPE, 2 SIZE, 3 COUNT"),
     "noxyz.pcd": (pcd("binary", 1, TWELVE, FIELDS="a b c"), "no field x"),
     "twice.pcd": (pcd("binary", 1, TWELVE, FIELDS="x x z"), "fields x x z"),
     "kind.pcd": (pcd("zip", 1, TWELVE), "DATA zip"),
@@ -185,7 +185,7 @@ BROKEN = {
     "many.ply": (ply(MANY, TWELVE), "100000000 points"),
     "list.ply": (ply(1, TWELVE, extra="property list uchar int i\n"), "a list in vertex"),
     "type.ply": (ply(1, TWELVE, extra="property complex c\n"), "a line 'property complex c'"),
-    "lines.ply": (ply(2, b"1 2 3\n", "ascii"), "1 lines of points"),
+    "lines.ply": (ply(2, b"1 2 3\n", "ascii"), "1 line of points"),
     "none.ply": (b"ply\nformat ascii 1.0\nelement face 0\nproperty int a\nend_header\n", "no element vertex"),
 }
 
@@ -211,7 +211,7 @@ def test_a_header_that_numpy_does_not_write(tmp_path: Path, header: str) -> None
 
 def test_a_zip_of_zeros_takes_no_memory(tmp_path: Path) -> None:
     np.savez_compressed(tmp_path / "a.npz", x=np.zeros(80_000_000, np.float64))
-    with pytest.raises(DataError, match="1 arrays of 640000128 bytes, expected at most 64 of"):
+    with pytest.raises(DataError, match="1 array of 640000128 bytes, expected at most 64 of"):
         read_cloud(tmp_path / "a.npz")
 
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from stored import simulated
 
 from sst_graph import CalibrationConfig, calibrate
-from sst_graph.batch.calibrate import prepare_drives
+from sst_graph.batch.calibrate import prepare_drives, scan_hashes
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.diagnosis import Fit, other_camera, preflight
 from sst_graph.diagnosis.cameras import image_size
@@ -115,7 +115,9 @@ def test_scans_that_are_given_twice_make_no_result_surer() -> None:
         drives = prepare_drives(given, CalibrationConfig())
         found = [finding.evidence for finding in preflight(drives, drive().nominal, CLASSES)]
         assert len(found) == count
-        assert all(sentence.startswith("1 scans of") for sentence in found)
+        hashes = [scan_hashes([each]) for each in drives]
+        assert [len(own) for own in hashes] == [end, 5] and len({*hashes[0], *hashes[1]}) == end + 5 - count
+        assert all(sentence.startswith(f"{drive().name} has 1 scan of ") for sentence in found)
 
 
 def test_frames_without_content_are_no_repeated_ones() -> None:

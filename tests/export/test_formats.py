@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -190,7 +191,8 @@ def test_every_format_with_comments_states_axes_direction_and_sign(target: str) 
         status="unobservable",
         drive_offsets=(DriveOffset("a--b", 0.1, 0.01),),
     )
-    text = export_text(result, target, ExportOptions("cam", None, "lid"))
+    camera_frame = None if target == "nuscenes" else "cam"
+    text = export_text(result, target, ExportOptions(camera_frame, None, "lid"))
     assert "t_lidar = t_camera_stamp + time_offset_s, time_offset_s = -0.0375" in text
     assert "STATUS unobservable" in text and "+0.100000 s" in text
     assert "z forward" in text or "x forward" in text
@@ -230,9 +232,17 @@ def test_refuses_what_it_cannot_write() -> None:
         ("kitti", ExportOptions(parent="lidar")),
         ("opencv", ExportOptions(child="lidar")),
         ("autoware", ExportOptions(child="lidar")),
+        ("nuscenes", ExportOptions(camera_frame="eye")),
+        ("gtsam", ExportOptions(camera_frame="eye")),
+        ("kalibr", ExportOptions(camera_link="eye_link")),
+        ("kitti", ExportOptions(lidar_frame="top")),
     ):
         with pytest.raises(ConfigError, match="goes with --to ros-tf"):
             export_text(result, target, options)
+    link = ExportOptions(camera_link="eye_link", child="lidar")
+    with pytest.raises(ConfigError, match="--camera-link eye_link would change nothing"):
+        export_text(result, "urdf", link)
+    assert "eye_link" in export_text(result, "urdf", dataclasses.replace(link, parent="eye_link"))
 
 
 @pytest.mark.parametrize("name", ["1e5", "yes", "null", "2", "0.5", "_", "/lidar"])

@@ -426,6 +426,45 @@ def test_a_direction_that_one_marginal_does_not_tell_contradicts_nothing() -> No
     assert fused.time_offset_s == pytest.approx(OFFSET_S, abs=0.005)
 
 
+SCANS = tuple(f"{k:016x}" for k in range(32))
+
+
+def test_marginals_of_the_same_scans_are_refused() -> None:
+    """Counted twice they make the fused result too sure; a single scan in common is enough."""
+    one, other = (replace(agreeing(k), scan_hashes=SCANS[8 * k : 8 * k + 8]) for k in (1, 2))
+    again = replace(agreeing(3), scan_hashes=(SCANS[15], SCANS[31]))
+    fused = fuse_marginals([one, other])
+    assert fused.scan_hashes == SCANS[8:24] == one.plus(other).scan_hashes
+    for parts, names in (([one, other, again], ("a", "b", "c")), ([fused, again], ("b", "c"))):
+        with pytest.raises(EstimationError, match=r"'[ab]' and 'c' are of the same scans: counted twice"):
+            fuse_marginals(parts, names=names)
+    assert set(fuse_marginals([fused, again], significance=0.0).scan_hashes) > {SCANS[31]}
+
+
+def test_equal_marginals_are_refused_without_knowing_their_scans() -> None:
+    """As those of older files, and of graphs."""
+    with pytest.raises(EstimationError, match="number 0 and number 1 are of the same scans"):
+        fuse_marginals([agreeing(1), agreeing(1)])
+    graph, start = drive(3)
+    with pytest.raises(EstimationError, match="number 0 and number 1 are of the same scans"):
+        fuse_graphs([(graph, start), (graph, start)])
+
+
+def test_scans_in_a_file() -> None:
+    known = replace(agreeing(1), scan_hashes=SCANS)
+    assert CalibrationMarginal.from_json(known.to_json()) == known
+    assert "scan_hashes" not in agreeing(1).to_json()
+    found = marginal_of_result(
+        CalibrationResult(TRUE, OFFSET_S, covariance(1), "ok", CAMERA, diagnostics={"scan_hashes": SCANS[:2]})
+    )
+    assert found.scan_hashes == SCANS[:2]
+    for wrong in ("abc", "A" * 16, 5, "0" * 17):
+        with pytest.raises(FactorError, match="scan_hashes of CalibrationMarginal"):
+            replace(known, scan_hashes=(wrong,))  # type: ignore[arg-type]
+        with pytest.raises(DataError, match="scan_hashes"):
+            CalibrationMarginal.from_json(json.dumps({**json.loads(known.to_json()), "scan_hashes": [wrong]}))
+
+
 def test_fusion_ends_at_the_optimum_also_from_far_apart() -> None:
     one, other = agreeing(1), knocked(agreeing(2), 0, np.radians(3.0))
     fused = fuse_marginals([one, other], significance=0.0)
@@ -444,7 +483,7 @@ def test_graphs_of_drives_with_two_mounts_are_refused() -> None:
         fuse_graphs(graphs)
     fused, _ = fuse_graphs(graphs, significance=0.0)
     assert in_sigmas(fused, *_batch(graphs)) < 1e-3
-    with pytest.raises(EstimationError, match="found 1 names, expected 2"):
+    with pytest.raises(EstimationError, match="found 1 name, expected 2"):
         fuse_marginals([agreeing(1), agreeing(2)], names=("a",))
 
 

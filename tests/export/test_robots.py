@@ -390,7 +390,8 @@ def test_a_result_of_any_name(tmp_path: Path) -> None:
     """Topics as names of cameras."""
     result: CalibrationResult = dataclasses.replace(turned(3), camera_name="/front left/image: raw")
     for target in (*TREES, "autoware", "kalibr", "openvins", "mins", "opencv", "nuscenes", "kitti"):
-        text = export_text(result, target, ExportOptions(camera_frame="{camera}_optical_frame"))
+        frame = None if target in ("nuscenes", "kitti") else "{camera}_optical_frame"
+        text = export_text(result, target, ExportOptions(camera_frame=frame))
         if target in READERS:
             ((edge, _),) = READERS[target](text, tmp_path).items()
             assert edge == ("front_left_image_raw_optical_frame", "lidar")

@@ -170,6 +170,22 @@ def test_what_drives_have_in_common_does_not_average_out() -> None:
     assert np.linalg.norm(fused.cTl.localCoordinates(now.cTl)) < 1e-5
 
 
+def test_a_drive_that_is_there_twice_counts_once() -> None:
+    drives, scans = [drive(name, "v") for name in ("a", "copy", "b")], ("0" * 16, "1" * 16, "2" * 16)
+    records = {
+        name: done(name, replace(result(k), diagnostics={**result(k).diagnostics, "scan_hashes": scans[k:]}))
+        for name, k in (("a", 1), ("copy", 1))
+    }
+    records["b"] = done("b", result(2))
+    found = vehicle_of("v", drives, records, WalkConfig())
+    assert found.drives == ("a", "b")
+    assert found.without == {"copy": "it holds scans of a, which count once"}
+    assert Record.from_json(records["copy"].to_json().encode(), "record.json") == records["copy"]
+    alone = vehicle_of("v", [drives[0], drives[2]], records, WalkConfig()).calibration
+    assert found.calibration is not None and alone is not None
+    np.testing.assert_array_equal(found.calibration.covariance, alone.covariance)
+
+
 def test_drives_without_dates_count_in_their_order() -> None:
     drives = [drive("z", "v"), drive("a", "v"), drive("m", "v", "2026-03-01T00:00:00+00:00")]
     records = {one.name: done(one.name, result(k)) for k, one in enumerate(drives)}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -111,6 +113,22 @@ def test_motion_and_assumptions_of_the_lidar_are_shared() -> None:
         _camera(1, motion=1e-3, assumption=2e-3), _camera(2, far, motion=3e-3, assumption=1e-3)
     )
     np.testing.assert_allclose(matrix[:7, 7:], np.full((7, 7), 6 * 3e-6 + 2e-6), rtol=1e-6)
+
+
+def test_errors_of_the_lidar_are_added_in_their_own_order() -> None:
+    """To the last bit, in every process: sets of texts have an order that differs from run to run."""
+    rng = np.random.default_rng(5)
+    steps = {f"error {k}": 10.0 ** rng.uniform(-9, 0) * rng.standard_normal(7) for k in range(30)}
+    in_order = np.zeros((7, 7))
+    for step in steps.values():
+        in_order += np.outer(step, step)
+    nothing = np.full((FEWEST, 7), np.nan)
+    by_edges = SharedErrors(nothing, steps)
+    np.testing.assert_array_equal(by_edges.cross_covariance(by_edges), in_order)
+    by_labels = replace(_camera(1), assumptions=steps)
+    other = replace(_camera(2, NAMES + 100), assumptions=dict(reversed(steps.items())))
+    found = joint_covariance([100.0 * np.eye(7)] * 2, [by_labels, other]).matrix
+    np.testing.assert_array_equal(found[:7, 7:], in_order)
 
 
 def test_a_camera_without_estimate_has_nothing_in_common() -> None:

@@ -236,7 +236,7 @@ def test_refuses_what_is_no_term(street: Street) -> None:
         solve_with_terms(*far, terms_of(street))
     with pytest.raises(DataError, match="a stamp after 5 ns"):
         Trajectory([X(0), X(1)], [5, 5])
-    with pytest.raises(DataError, match="2 keys, 1 stamps"):
+    with pytest.raises(DataError, match="2 keys, 1 stamp"):
         Trajectory([X(0), X(1)], [5])
     keys = AlignmentKeys(street.trajectory(), E, D)
     with pytest.raises(DataError, match="no scan"):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sst_graph.edges.agreement import score
 from sst_graph.edges.search import angle_deg
 from sst_graph.edges.turns import turned_states
+from sst_graph.errors import count_of
 from sst_graph.graph.matching import DriveEdges
 from sst_graph.graph.outer_loop import JointSolution
 from sst_graph.graph.state import State, difference
@@ -116,7 +117,7 @@ def edges_reasons(
     """Why the estimate may be wrong altogether; none where nothing says so."""
     reasons = []
     if not solution.converged:
-        reasons.append(f"the outer loop still moved after {solution.outer_iterations} iterations")
+        reasons.append(f"the outer loop still moved after {count_of(solution.outer_iterations, 'iteration')}")
     reasons += contrast_reasons(contrast)
     if motion is not None:
         step = difference(motion.state, solution.state)[[0, 1, 2, 6]]

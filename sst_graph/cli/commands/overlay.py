@@ -12,7 +12,7 @@ from sst_graph.cli.progress import ProgressBar
 from sst_graph.cli.reading import open_drive_of
 from sst_graph.cli.video import VIDEO_FILE, write_drive_video
 from sst_graph.data.frame_parts import RecentReader
-from sst_graph.errors import ConfigError
+from sst_graph.errors import ConfigError, count_of
 from sst_graph.files import output_file
 from sst_graph.odometry.sweep import with_sweep_of
 from sst_graph.reference import load_initial
@@ -59,7 +59,7 @@ def _write_video(args: argparse.Namespace) -> int:
         with ProgressBar() as progress:
             count = write_drive_video(out.partial, args.video, result, drives, progress.stage("video"))
         out.publish()
-    mention(f"wrote {args.video}: {count} frames of {source.name}")
+    mention(f"wrote {args.video}: {count_of(count, 'frame')} of {source.name}")
     return 0
 
 

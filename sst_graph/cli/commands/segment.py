@@ -9,7 +9,7 @@ from sst_graph.cli.messages import mention
 from sst_graph.cli.outputs import check_apart
 from sst_graph.cli.progress import ProgressBar
 from sst_graph.cli.reading import open_drive
-from sst_graph.errors import ConfigError
+from sst_graph.errors import ConfigError, count_of
 from sst_graph.segmentation import LabelledSource, Labelling, segment_drive
 
 
@@ -28,5 +28,7 @@ def run(args: argparse.Namespace) -> int:
     drive = LabelledSource(source, Labelling.of(store, images, scans, stored=False))
     with ProgressBar() as progress:
         counts = segment_drive(drive, progress.stage("labels"))
-    mention(f"{drive.name}: {counts['made']} labels made, {counts['found']} found, in {store.folder}")
+    mention(
+        f"{drive.name}: {count_of(counts['made'], 'label')} made, {counts['found']} found, in {store.folder}"
+    )
     return 0

@@ -8,6 +8,7 @@ from sst_graph.cli.inputs import settings
 from sst_graph.cli.messages import mention
 from sst_graph.cli.outputs import check_apart
 from sst_graph.cli.progress import ProgressBar
+from sst_graph.errors import count_of
 from sst_graph.files import atomic_directory
 from sst_graph.simulator import DRIVE, SimulationConfig, fill_drive, simulate
 
@@ -27,5 +28,8 @@ def run(args: argparse.Namespace) -> int:
     with atomic_directory(args.out, args.overwrite, DRIVE) as folder, ProgressBar() as progress:
         drive = simulate(config)
         fill_drive(drive, folder, progress.stage("simulate"), args.stereo)
-    mention(f"wrote {args.out}: {len(drive)} frames, true time offset {1e3 * config.time_offset_s:+.1f} ms")
+    mention(
+        f"wrote {args.out}: {count_of(len(drive), 'frame')}, true time offset "
+        f"{1e3 * config.time_offset_s:+.1f} ms"
+    )
     return 0

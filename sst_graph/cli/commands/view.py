@@ -14,7 +14,7 @@ from sst_graph.cli.outputs import RERUN_FILE, check_apart
 from sst_graph.cli.pictures import offset_of
 from sst_graph.cli.progress import ProgressBar, counted
 from sst_graph.cli.reading import open_drive_of
-from sst_graph.errors import ConfigError
+from sst_graph.errors import ConfigError, count_of
 from sst_graph.files import output_file
 from sst_graph.inspect.inspection import inspect_result
 from sst_graph.odometry.sweep import with_sweep_of
@@ -40,7 +40,10 @@ def run(args: argparse.Namespace) -> int:
             count = _log(recording, result, source)
         if out is not None:
             out.publish()
-            mention(f"wrote {args.save}: {count} frames of {source.name} (open it with: rerun {args.save})")
+            mention(
+                f"wrote {args.save}: {count_of(count, 'frame')} of {source.name} (open it with: rerun "
+                f"{args.save})"
+            )
     return 0
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.data.arrays import listed
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 from sst_graph.files.reading import FileKind, read_text
 from sst_graph.timestamps import MAX_STAMPS, check_rising, parse_seconds
 from sst_graph.validation import LATEST_NS
@@ -91,7 +91,7 @@ def _table(table: Path, files: Mapping[str, Path]) -> dict[str, int]:
     """Stamps by name."""
     text = read_text(table, STAMPS_CSV)
     if text.count("\n") > MAX_STAMPS:
-        raise DataError(table, f"{text.count(chr(10))} lines", f"at most {MAX_STAMPS} stamps")
+        raise DataError(table, count_of(text.count(chr(10)), "line"), f"at most {MAX_STAMPS} stamps")
     stamps: dict[str, int] = {}
     for number, line in enumerate(text.splitlines(), 1):
         words = [word.strip().strip('"') for word in line.split(",")]

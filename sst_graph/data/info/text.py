@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from sst_graph.data.info.summary import DriveInfo, ImageInfo, ScanInfo, SensorInfo
+from sst_graph.errors import count_of
 
 _WIDTH = 12
 _GAPS = 3
@@ -17,7 +18,7 @@ def info_text(info: DriveInfo) -> str:
 
 
 def _lines(info: DriveInfo) -> Iterator[tuple[str, str]]:
-    yield "drive", f"{info.name}: {info.frames} frames"
+    yield "drive", f"{info.name}: {count_of(info.frames, 'frame')}"
     c = info.camera
     yield (
         "camera",
@@ -50,7 +51,7 @@ def _sensor(sensor: SensorInfo) -> str:
     if sensor.first_ns is not None and sensor.last_ns is not None:
         parts.append(f"{_stamp(sensor.first_ns)} to {_stamp(sensor.last_ns)}")
     if sensor.gap_count is not None:
-        parts.append(f"{sensor.gap_count} gaps")
+        parts.append(count_of(sensor.gap_count, "gap"))
     return ", ".join(parts)
 
 
@@ -75,7 +76,7 @@ def _share(share: float) -> str:
 
 def _cloud(scans: ScanInfo) -> str:
     times = "no times of points" if scans.time_span_s is None else f"times over {scans.time_span_s:.4f} s"
-    rings = f"{scans.rings} rings" if scans.rings else "no rings"
+    rings = count_of(scans.rings, "ring") if scans.rings else "no rings"
     left_out = f", {scans.left_out} left out" if scans.left_out else ""
     return f"{scans.points} a scan{left_out}, {times}, {rings}"
 

@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.errors import ConfigError, DataError
+from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.files.checked_values import checked_pose, pinhole_camera
 from sst_graph.files.reading import CALIB_TXT, read_text
@@ -131,7 +131,7 @@ def read_calibration(path: Path) -> KittiCalibration:
 def _matrix(words: list[str], name: str, place: str) -> FloatArray:
     """(3, 4) matrix of twelve words."""
     if len(words) != 12:
-        raise DataError(place, f"{len(words)} values for {name}", "12")
+        raise DataError(place, f"{count_of(len(words), 'value')} for {name}", "12")
     try:
         values = np.array([float(word) for word in words])
     except ValueError:

@@ -10,7 +10,7 @@ from functools import cached_property
 from pathlib import Path
 
 from sst_graph.data.arrays import listed, numbered_files
-from sst_graph.errors import ConfigError, DataError
+from sst_graph.errors import ConfigError, DataError, count_of
 
 LAYOUT = (
     "KITTI odometry: PATH/sequences/NN with calib.txt, times.txt, velodyne, image_2; labels, "
@@ -48,13 +48,16 @@ class KittiFiles:
     def missing(self) -> str:
         """What is missing, in words and numbers; empty where nothing is."""
         owners = (
-            ("scans without labels", set(self.scans) - set(self.labels)),
-            ("labels without a scan", set(self.labels) - set(self.scans)),
-            ("pictures without a mask", set(self.images) - set(self.masks)),
-            ("masks without a picture", set(self.masks) - set(self.images)),
+            ("scan", "without labels", set(self.scans) - set(self.labels)),
+            ("label", "without a scan", set(self.labels) - set(self.scans)),
+            ("picture", "without a mask", set(self.images) - set(self.masks)),
+            ("mask", "without a picture", set(self.masks) - set(self.images)),
         )
-        found = (f"{len(lonely)} {what} (first: {min(lonely)})" for what, lonely in owners if lonely)
-        return ", ".join(found)
+        return ", ".join(
+            f"{count_of(len(lonely), what)} {without} (first: {min(lonely)})"
+            for what, without, lonely in owners
+            if lonely
+        )
 
 
 def is_kitti(path: Path) -> bool:
@@ -164,7 +167,7 @@ def _check_stamps(times: Path, stamps: int, files: Mapping[int, Path], what: str
     """Require a stamp for each number up to the last file's, and no more."""
     count = max(files) + 1
     if count != stamps:
-        raise DataError(times, f"{stamps} stamps", f"{count}, as there are {what}")
+        raise DataError(times, count_of(stamps, "stamp"), f"{count}, as there are {what}")
 
 
 def _optional(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
@@ -179,7 +182,9 @@ def _point_times(folder: Path, scans: Mapping[int, Path]) -> dict[int, Path] | N
     files = numbered_files(folder, (".bin",))
     lonely = sorted(set(scans) - set(files))
     if lonely:
-        raise DataError(folder, f"no file for frame {lonely[0]}", f"one for each of {len(scans)} frames")
+        raise DataError(
+            folder, f"no file for frame {lonely[0]}", f"one for each of {count_of(len(scans), 'frame')}"
+        )
     return files
 
 

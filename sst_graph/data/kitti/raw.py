@@ -40,7 +40,7 @@ from sst_graph.data.rectified import RectifiedSource
 from sst_graph.data.scan_order import rings_from_order
 from sst_graph.data.source import TURNS, Loader, SourceOptions
 from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
-from sst_graph.errors import ConfigError, DataError, printable
+from sst_graph.errors import ConfigError, DataError, count_of, printable
 from sst_graph.files.reading import FileKind, read_text
 from sst_graph.sweep_timing import SweepStamp, SweepTiming
 from sst_graph.types import CameraImage, GroundTruth, Scan, Source, with_intensities
@@ -115,7 +115,7 @@ def read_text_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.float3
     """
     text = read_text(path, TEXT_SCAN)
     if text.count("\n") > MAX_POINTS:
-        raise DataError(path, f"{text.count(chr(10))} lines", f"at most {MAX_POINTS}")
+        raise DataError(path, count_of(text.count(chr(10)), "line"), f"at most {MAX_POINTS}")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of a file without lines
@@ -123,7 +123,7 @@ def read_text_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.float3
     except ValueError as error:
         raise DataError(path, f"no numbers ({str(error).splitlines()[0]})", "lines of x y z r") from None
     if values.size and values.shape[1] != 4:
-        raise DataError(path, f"{values.shape[1]} numbers a line", "4: x y z r")
+        raise DataError(path, f"{count_of(values.shape[1], 'number')} a line", "4: x y z r")
     values = values.reshape(-1, 4)
     points = np.ascontiguousarray(values[:, :3])
     check_metres(points, path)

@@ -21,7 +21,7 @@ from sst_graph.cameras import BrownConradyCamera, CameraModel
 from sst_graph.cameras.readers import camera_from_kitti_raw
 from sst_graph.cameras.tables import read_kitti_raw
 from sst_graph.data.kitti.calib import KittiCalibration, pose_from
-from sst_graph.errors import ConfigError, DataError
+from sst_graph.errors import ConfigError, DataError, count_of
 
 FloatArray = NDArray[np.float64]
 
@@ -82,10 +82,10 @@ class RawCalibration:
     def _line(self, name: str, count: int) -> FloatArray:
         path = self.folder / CAM_TO_CAM
         if name not in self.cameras:
-            raise DataError(path, f"no line {name}", f"{name}: {count} numbers")
+            raise DataError(path, f"no line {name}", f"{name}: {count_of(count, 'number')}")
         values = self.cameras[name]
         if len(values) != count:
-            raise DataError(path, f"{len(values)} values for {name}", f"{count}")
+            raise DataError(path, f"{count_of(len(values), 'value')} for {name}", f"{count}")
         return values
 
 
@@ -100,7 +100,7 @@ def read_raw_calibration(folder: Path) -> RawCalibration:
     lidar = read_kitti_raw(path)
     for name, count in (("R", 9), ("T", 3)):
         if len(lidar.get(name, ())) != count:
-            raise DataError(path, f"{len(lidar.get(name, ()))} values for {name}", f"{count}")
+            raise DataError(path, f"{count_of(len(lidar.get(name, ())), 'value')} for {name}", f"{count}")
     matrix = np.column_stack([lidar["R"].reshape(3, 3), lidar["T"]])
     return RawCalibration(folder, cameras, pose_from(matrix, f"{path} (R, T)"))
 

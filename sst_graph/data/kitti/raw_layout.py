@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sst_graph.data.arrays import listed, numbered_files
 from sst_graph.data.kitti.raw_calib import CAM_TO_CAM, VELO_TO_CAM
-from sst_graph.errors import ConfigError, DataError
+from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.files.reading import FileKind, read_text
 from sst_graph.timestamps import MAX_STAMPS, NS_PER_S, check_rising
 
@@ -110,7 +110,7 @@ def find_raw_files(drive: Path, camera: int) -> RawFiles:
     for files, stamps, folder in ((scans, scan_stamps, cloud), (pictures, image_stamps, images)):
         if max(files) >= len(stamps):
             expected = f"{max(files) + 1} or more: one for {files[max(files)].name}"
-            raise DataError(folder / "timestamps.txt", f"{len(stamps)} stamps", expected)
+            raise DataError(folder / "timestamps.txt", count_of(len(stamps), "stamp"), expected)
     return RawFiles(
         scans=scans,
         labels=_optional(drive / "labels", (".label",)),
@@ -130,7 +130,7 @@ def read_timestamps(path: Path) -> NDArray[np.int64]:
     """
     lines = read_text(path, TIMESTAMPS).rstrip().splitlines()
     if not 1 <= len(lines) <= MAX_STAMPS:
-        raise DataError(path, f"{len(lines)} lines", f"1 to {MAX_STAMPS} stamps")
+        raise DataError(path, count_of(len(lines), "line"), f"1 to {MAX_STAMPS} stamps")
     stamps_ns = np.array([_stamp(line, f"{path}:{k}") for k, line in enumerate(lines, 1)], np.int64)
     check_rising(stamps_ns, path)
     return stamps_ns
@@ -155,7 +155,7 @@ def _sweeps(cloud: Path, count: int) -> SweepTimes | None:
     starts, ends = (read_timestamps(path) for path in paths)
     for path, stamps in zip(paths, (starts, ends), strict=True):
         if len(stamps) != count:
-            raise DataError(path, f"{len(stamps)} stamps", f"{count}, as in timestamps.txt")
+            raise DataError(path, count_of(len(stamps), "stamp"), f"{count}, as in timestamps.txt")
     lengths = ends - starts
     if not ((lengths > 0) & (lengths < NS_PER_S)).all():
         k = int(np.argmin((lengths > 0) & (lengths < NS_PER_S)))

@@ -27,7 +27,7 @@ from sst_graph.data.pictures import PictureFiles
 from sst_graph.data.rectified import RectifiedSource
 from sst_graph.data.source import TURNS, Loader, SourceOptions
 from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
-from sst_graph.errors import ConfigError, DataError, printable
+from sst_graph.errors import ConfigError, DataError, count_of, printable
 from sst_graph.files.reading import FileKind, read_file
 from sst_graph.sweep_timing import SweepTiming
 from sst_graph.types import CameraImage, GroundTruth, Scan, SemanticClass, Source, with_intensities
@@ -79,7 +79,7 @@ class LidarFiles:
         path = self.paths[k]
         data = read_file(path, _PCD_BIN)
         if len(data) % 20:
-            raise DataError(path, f"{len(data)} bytes", f"a multiple of 20 ({_PCD_BIN.name})")
+            raise DataError(path, count_of(len(data), "byte"), f"a multiple of 20 ({_PCD_BIN.name})")
         values = np.frombuffer(data, "<f4").reshape(-1, 5)
         points = np.ascontiguousarray(values[:, :3])
         check_metres(points, path)
@@ -105,7 +105,7 @@ class LidarFiles:
             return np.full(int(used.sum()), SemanticClass.IGNORE, np.uint8)
         labels = np.frombuffer(read_file(path, _LIDARSEG), np.uint8)
         if len(labels) != len(used):
-            raise DataError(path, f"{len(labels)} labels", f"{len(used)}, one a point of the scan")
+            raise DataError(path, count_of(len(labels), "label"), f"{len(used)}, one a point of the scan")
         return classes_of_lidarseg(labels[used], path)
 
 
@@ -166,7 +166,7 @@ def _scene(tables: Path, name: str | None) -> Record:
     if not found:
         some = ", ".join(list(scenes)[:12]) + (", ..." if len(scenes) > 12 else "")
         asked = "name one of them" if name is None else f"none is {name!r}"
-        raise ConfigError(f"{tables}: {len(scenes)} scenes ({some}): {asked}")
+        raise ConfigError(f"{tables}: {count_of(len(scenes), 'scene')} ({some}): {asked}")
     return found[0]
 
 
@@ -205,7 +205,9 @@ def _channels(tables: Path, scene: Record, camera: str) -> tuple[Channel, Channe
     found = []
     for name in (_LIDAR, camera):
         if len(rigs[name]) != 1:
-            raise DataError(data_path, f"{len(rigs[name])} calibrations of {name} in the scene", "one")
+            raise DataError(
+                data_path, f"{count_of(len(rigs[name]), 'calibration')} of {name} in the scene", "one"
+            )
         rows = tuple(sorted(data[name], key=lambda row: whole_of(row, "timestamp", data_path)))
         found.append(Channel(name, calibrations[next(iter(rigs[name]))], rows))
     return found[0], found[1]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from sst_graph.data.arrays import MAX_POINTS
 from sst_graph.data.point_files.cloud import MAX_POINT_BYTES, Cloud, check_count, cloud_of, structured_fields
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 
 _MAX_BYTES = 512 * 1024 * 1024
 """Of one array, unpacked."""
@@ -45,7 +45,7 @@ def read_bin(data: bytes, path: Path) -> Cloud:
         DataError: a truncated file.
     """
     if len(data) % 16:
-        raise DataError(path, f"{len(data)} bytes", "a multiple of 16 (x y z intensity in float32)")
+        raise DataError(path, count_of(len(data), "byte"), "a multiple of 16 (x y z intensity in float32)")
     values = np.frombuffer(data, "<f4").reshape(-1, 4)
     return cloud_of(path, {name: values[:, k] for k, name in enumerate(_COLUMNS)})
 
@@ -72,7 +72,7 @@ def read_npz(data: bytes, path: Path) -> Cloud:
             # by the directory, before a byte is unpacked
             unpacked = sum(member.file_size for member in members)
             if len(members) > 64 or unpacked > _MAX_BYTES:
-                found = f"{len(members)} arrays of {unpacked} bytes"
+                found = f"{count_of(len(members), 'array')} of {count_of(unpacked, 'byte')}"
                 raise DataError(path, found, f"at most 64 of {_MAX_BYTES} bytes")
             arrays = {}
             for member in members:
@@ -112,7 +112,9 @@ def _array(data: bytes, path: Path) -> NDArray[Any]:
         count *= int(length)
     rest = len(data) - stream.tell()
     if min(shape) < 0 or shape[0] > MAX_POINTS or count * dtype.itemsize != rest:
-        raise DataError(path, f"{rest} bytes behind the header", f"those of an array of shape {shape}")
+        raise DataError(
+            path, f"{count_of(rest, 'byte')} behind the header", f"those of an array of shape {shape}"
+        )
     array = np.frombuffer(data, dtype, count, stream.tell())
     return array.reshape(shape, order="F" if fortran else "C")
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.data.arrays import MAX_POINTS, check_metres
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 from sst_graph.files.reading import FileKind
 
 CLOUD_FILE = FileKind("a point cloud", 512 * 1024 * 1024)
@@ -98,7 +98,8 @@ class Cloud:
                 seconds = seconds - stamp_ns * 1e-9
         bad = np.flatnonzero(used & ~(np.abs(seconds) <= _LONGEST_S))
         if len(bad):
-            found = f"{len(bad)} times that are NaN or beyond {_LONGEST_S:g} s, first at index {bad[0]}"
+            times = count_of(len(bad), "time that is", "times that are")
+            found = f"{times} NaN or beyond {_LONGEST_S:g} s, first at index {bad[0]}"
             expected = "seconds in floats or nanoseconds in whole numbers, absolute or after the scan's stamp"
             raise DataError(self.path, found, expected)
         return np.where(used, seconds, 0.0).astype(np.float32)
@@ -137,7 +138,7 @@ def cloud_of(path: Path, fields: Mapping[str, NDArray[Any]]) -> Cloud:
     for name, values in used.items():
         if values.dtype.kind not in "fiu" or values.shape != (count,):
             found = f"{name} of {values.dtype}, shape {values.shape}"
-            raise DataError(path, found, f"numbers, one a point ({count} points)")
+            raise DataError(path, found, f"numbers, one a point ({count_of(count, 'point')})")
     check_count(path, count)
     return Cloud(path, used)
 
@@ -149,7 +150,7 @@ def check_count(path: Path, count: int) -> None:
         DataError: more than MAX_POINTS.
     """
     if not 0 <= count <= MAX_POINTS:
-        raise DataError(path, f"{count} points", f"0 to {MAX_POINTS}")
+        raise DataError(path, count_of(count, "point"), f"0 to {MAX_POINTS}")
 
 
 def structured_fields(path: Path, records: NDArray[Any]) -> dict[str, NDArray[Any]]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 
 
 def unpack_lzf(packed: bytes, size: int, path: Path) -> bytes:
@@ -44,7 +44,7 @@ def unpack_lzf(packed: bytes, size: int, path: Path) -> bytes:
             if len(out) > size:
                 raise IndexError
     except IndexError:
-        raise DataError(path, f"a damaged LZF block at byte {at}", f"{size} unpacked bytes") from None
+        raise DataError(path, f"a damaged LZF block at byte {at}", count_of(size, "unpacked byte")) from None
     if len(out) != size:
-        raise DataError(path, f"{len(out)} unpacked bytes", f"{size}")
+        raise DataError(path, count_of(len(out), "unpacked byte"), f"{size}")
     return bytes(out)

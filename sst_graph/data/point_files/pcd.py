@@ -24,7 +24,7 @@ from sst_graph.data.point_files.cloud import (
 )
 from sst_graph.data.point_files.lzf import unpack_lzf
 from sst_graph.data.point_files.text import text_records
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 
 _MAX_HEADER = 64 * 1024
 _TYPES = {
@@ -100,7 +100,7 @@ def _dtype(
     names: list[str], kinds: list[str], sizes: list[int], counts: list[int], path: Path
 ) -> np.dtype[Any]:
     if not names or not len(names) == len(kinds) == len(sizes) == len(counts):
-        found = f"{len(names)} fields, {len(kinds)} types, {len(sizes)} sizes, {len(counts)} counts"
+        found = f"{len(names)} FIELDS, {len(kinds)} TYPE, {len(sizes)} SIZE, {len(counts)} COUNT"
         raise DataError(path, found, "as many of each")
     fields: list[tuple[Any, ...]] = []
     for k, (name, kind, size, count) in enumerate(zip(names, kinds, sizes, counts, strict=True)):
@@ -115,29 +115,33 @@ def _dtype(
     except ValueError:
         raise DataError(path, f"fields {' '.join(names)}"[:200], "fields of different names") from None
     if dtype.itemsize > MAX_POINT_BYTES:
-        raise DataError(path, f"{dtype.itemsize} bytes a point", f"at most {MAX_POINT_BYTES}")
+        raise DataError(path, f"{count_of(dtype.itemsize, 'byte')} a point", f"at most {MAX_POINT_BYTES}")
     return dtype
 
 
 def _binary(body: bytes, header: PcdHeader, path: Path) -> NDArray[Any]:
     size = header.count * header.dtype.itemsize
     if len(body) < size:
-        raise DataError(path, f"{len(body)} bytes of points", f"{size} for {header.count} points")
+        raise DataError(
+            path, f"{count_of(len(body), 'byte')} of points", f"{size} for {count_of(header.count, 'point')}"
+        )
     return np.frombuffer(body, header.dtype, header.count)
 
 
 def _compressed(body: bytes, header: PcdHeader, path: Path) -> NDArray[Any]:
     """Records of fields that stand one after the other, packed."""
     if len(body) < 8:
-        raise DataError(path, f"{len(body)} bytes of points", "the sizes of a compressed block")
+        raise DataError(path, f"{count_of(len(body), 'byte')} of points", "the sizes of a compressed block")
     packed, size = struct.unpack_from("<II", body)
     if size != header.count * header.dtype.itemsize:
-        expected = f"{header.count * header.dtype.itemsize} for {header.count} points"
-        raise DataError(path, f"{size} unpacked bytes declared", expected)
+        expected = f"{header.count * header.dtype.itemsize} for {count_of(header.count, 'point')}"
+        raise DataError(path, f"{count_of(size, 'unpacked byte')} declared", expected)
     if size > CLOUD_FILE.max_bytes:
-        raise DataError(path, f"{size} unpacked bytes declared", f"at most {CLOUD_FILE.max_bytes}")
+        raise DataError(
+            path, f"{count_of(size, 'unpacked byte')} declared", f"at most {CLOUD_FILE.max_bytes}"
+        )
     if len(body) - 8 < packed:
-        raise DataError(path, f"{len(body) - 8} compressed bytes", f"{packed}")
+        raise DataError(path, count_of(len(body) - 8, "compressed byte"), f"{packed}")
     columns = unpack_lzf(body[8 : 8 + packed], size, path)
     records = np.zeros(header.count, header.dtype)
     at = 0

@@ -21,7 +21,7 @@ from sst_graph.data.point_files.cloud import (
     structured_fields,
 )
 from sst_graph.data.point_files.text import text_records
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 
 _MAX_HEADER = 64 * 1024
 _EXPECTED = "a PLY header of version 1.0"
@@ -63,7 +63,11 @@ def _records(body: bytes, encoding: str, dtype: np.dtype[Any], count: int, path:
     if encoding == "ascii":
         return text_records(body, dtype, count, path)
     if len(body) < count * dtype.itemsize:
-        raise DataError(path, f"{len(body)} bytes of points", f"{count * dtype.itemsize} for {count} points")
+        raise DataError(
+            path,
+            f"{count_of(len(body), 'byte')} of points",
+            f"{count * dtype.itemsize} for {count_of(count, 'point')}",
+        )
     return np.frombuffer(body, dtype, count)
 
 
@@ -74,7 +78,9 @@ def _behind(data: bytes, at: int, encoding: str, size: int, element: _Element, p
     for _ in range(element.count):
         at = data.find(b"\n", at) + 1
         if at == 0:
-            raise DataError(path, f"fewer than {element.count} lines of {element.name}", "all of them")
+            raise DataError(
+                path, f"fewer than {count_of(element.count, 'line')} of {element.name}", "all of them"
+            )
     return at
 
 
@@ -113,5 +119,7 @@ def _dtype(element: _Element, order: str, path: Path) -> np.dtype[Any]:
     except ValueError:
         raise DataError(path, f"a property of {element.name:.40} twice", "different names") from None
     if not 0 < dtype.itemsize <= MAX_POINT_BYTES:
-        raise DataError(path, f"{dtype.itemsize} bytes for {element.name:.40}", f"1 to {MAX_POINT_BYTES}")
+        raise DataError(
+            path, f"{count_of(dtype.itemsize, 'byte')} for {element.name:.40}", f"1 to {MAX_POINT_BYTES}"
+        )
     return dtype

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 
 
 def text_records(body: bytes, dtype: np.dtype[Any], count: int, path: Path) -> NDArray[Any]:
@@ -23,7 +23,7 @@ def text_records(body: bytes, dtype: np.dtype[Any], count: int, path: Path) -> N
         return np.zeros(0, dtype)
     found = body.count(b"\n") + (not body.endswith(b"\n"))
     if found < count:
-        raise DataError(path, f"{found} lines of points", f"{count}")
+        raise DataError(path, f"{count_of(found, 'line')} of points", f"{count}")
     lines = body.split(b"\n", count)[:count]
     flat = np.dtype(
         [(f"{k}", part) for k, part in enumerate(_parts(dtype))]
@@ -36,10 +36,12 @@ def text_records(body: bytes, dtype: np.dtype[Any], count: int, path: Path) -> N
     except (ValueError, OverflowError) as error:
         line = (str(error).splitlines() or ["?"])[0]
         raise DataError(
-            path, f"points that are no numbers ({line})", f"{len(flat.names or ())} numbers a line"
+            path,
+            f"points that are no numbers ({line})",
+            f"{count_of(len(flat.names or ()), 'number')} a line",
         ) from None
     if len(records) != count:
-        raise DataError(path, f"{len(records)} lines of points", f"{count}")
+        raise DataError(path, f"{count_of(len(records), 'line')} of points", f"{count}")
     return np.frombuffer(np.ascontiguousarray(records).tobytes(), dtype, count)
 
 

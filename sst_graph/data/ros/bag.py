@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.errors import DataError, MissingDependencyError, SstGraphError
+from sst_graph.errors import DataError, MissingDependencyError, SstGraphError, count_of
 
 WHOLE_BAG = (
     "a whole ROS 1 bag, rosbag2 folder or mcap file; one that was cut short is repaired with "
@@ -200,7 +200,9 @@ class Bag:
                 seconds, nanoseconds, length = struct.unpack_from(f"{order}iII", data, 4)
                 length = max(length - 1, 0)
         except (struct.error, IndexError):
-            raise DataError(self.path, f"a message of {len(data)} bytes", "a std_msgs/Header") from None
+            raise DataError(
+                self.path, f"a message of {count_of(len(data), 'byte')}", "a std_msgs/Header"
+            ) from None
         frame = data[16 : 16 + length].decode("utf-8", "backslashreplace")
         return seconds * 1_000_000_000 + nanoseconds, frame.lstrip("/")
 

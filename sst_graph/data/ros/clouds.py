@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.data.arrays import MAX_POINTS
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 from sst_graph.validation import FARTHEST_M
 
 POINT_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -102,7 +102,9 @@ def _table(message: Any, place: str) -> NDArray[Any]:
     row = max(row, width * step) if height > 1 else width * step
     data = np.asarray(message.data, np.uint8)
     if len(data) < row * (height - 1) + width * step:
-        raise DataError(place, f"{len(data)} bytes", f"{width}x{height} points of {step} bytes")
+        raise DataError(
+            place, count_of(len(data), "byte"), f"{width}x{height} points of {count_of(step, 'byte')}"
+        )
     if row == width * step:
         packed = np.ascontiguousarray(data[: height * row])
     else:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sst_graph.data.images import MAX_PIXELS, decoded_mask, decoded_picture
 from sst_graph.data.ros.topics import COMPRESSED
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 
 _CHANNELS = {
     "mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, "8UC4": 4,
@@ -87,7 +87,7 @@ def _rows(message: Any, place: str) -> NDArray[np.uint8]:
     step = (height > 1 and int(message.step)) or width * channels
     data = np.asarray(message.data, np.uint8)
     if step < width * channels or len(data) < step * (height - 1) + width * channels:
-        found = f"{len(data)} bytes in rows of {step}"
+        found = f"{count_of(len(data), 'byte')} in rows of {step}"
         raise DataError(place, found, f"{width}x{height} px of {channels} bytes ({encoding})")
     padded = np.zeros(step * height, np.uint8)
     padded[: min(len(data), len(padded))] = data[: len(padded)]

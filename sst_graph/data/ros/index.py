@@ -12,7 +12,7 @@ from sst_graph.data.ros.bag import Bag, Message
 from sst_graph.data.ros.topics import Topics
 from sst_graph.data.ros.transforms import Transforms
 from sst_graph.data.source import Stamps
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 
 _STEP_BACK_NS = 1_000_000_000
 """Messages of one sensor arrive out of order by less than this; beyond it the clock was set back [ns]."""
@@ -101,7 +101,7 @@ def _rising(bag: Bag, topic: str, stamped: list[Stamped]) -> tuple[Stamped, ...]
     stamps = np.array([one.stamp_ns for one in stamped], np.int64)
     if zeros := int((stamps == 0).sum()):
         expected = "stamps of the sensor's driver (--stamps received takes the times of recording)"
-        raise DataError(place, f"{zeros} of {len(stamps)} messages with stamp 0", expected)
+        raise DataError(place, f"{zeros} of {count_of(len(stamps), 'message')} with stamp 0", expected)
     steps = np.diff(stamps)
     if len(steps) and int(steps.min()) < -_STEP_BACK_NS:
         k = int(np.argmin(steps))

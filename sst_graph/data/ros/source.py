@@ -24,7 +24,7 @@ from sst_graph.data.ros.index import BagIndex, Stamped, read_index
 from sst_graph.data.ros.topics import Topics, choose_topics
 from sst_graph.data.source import TURNS, Loader, SourceOptions
 from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
-from sst_graph.errors import ConfigError, DataError, printable
+from sst_graph.errors import ConfigError, DataError, count_of, printable
 from sst_graph.sampling import evenly_spread
 from sst_graph.sweep_timing import SweepTiming
 from sst_graph.types import CameraImage, Scan, SemanticClass, Source
@@ -128,7 +128,7 @@ def open_ros(path: Path, options: SourceOptions) -> Source:
     messages = BagMessages(bag, topics, index, size, encoding, timing, options.sweep == "auto")
     notes = [f"camera model from {topics.info.name}"]
     if index.repeated:
-        notes.append(f"{index.repeated} messages with the stamp of another were left out")
+        notes.append(f"left out {count_of(index.repeated, 'message')} with the stamp of another")
     model, name = geometry.model, printable(path.stem if path.is_file() else path.name)
     properties = DriveProperties(name, model.intrinsics, nominal, nominal_reason=reason, notes=tuple(notes))
     scans = Sensor(_stamps(index.clouds), messages.scan, _place_of(topics.cloud), topics.cloud.name)

@@ -10,7 +10,7 @@ from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 
-from sst_graph.errors import SstGraphError
+from sst_graph.errors import SstGraphError, count_of
 from sst_graph.experiments.paper.config import PaperTableConfig
 from sst_graph.experiments.paper.runs import Case, Run, runs_of
 
@@ -56,7 +56,8 @@ def run_groups(groups: Sequence[Sequence[Case]], config: PaperTableConfig) -> It
         first = ended[0]
         raise SstGraphError(
             f"{first.group[0].drive.name}: its process ended ({first.ending}) with {first.missing} of "
-            f"{len(first.group)} runs left; what is done is kept with --out, the same command does the rest"
+            f"{count_of(len(first.group), 'run')} left; what is done is kept with --out, the same "
+            "command does the rest"
         )
 
 

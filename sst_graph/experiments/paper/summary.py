@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sst_graph.errors import count_of
 from sst_graph.experiments.paper.config import START, VARIANTS, PaperTableConfig
 from sst_graph.experiments.paper.runs import Run
 
@@ -96,7 +97,8 @@ def _conditions(layout: Layout, config: PaperTableConfig) -> str:
         kind = "standing" if config.standing else f"at up to {config.speed_mps:g} m/s"
         last = config.seed + config.streets - 1
         drives = (
-            f"Simulated streets: {config.streets} (seeds {config.seed} to {last}, {config.frames} frames, "
+            f"Simulated streets: {config.streets} (seeds {config.seed} to {last}, "
+            f"{count_of(config.frames, 'frame')}, "
             f"{kind}, label noise {config.label_noise:g}); starts on each: {config.starts}"
         )
     time = (

@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.errors import EstimationError
+from sst_graph.errors import EstimationError, count_of
 from sst_graph.experiments.peers.frames import PeerProblem
 from sst_graph.hand_eye.graph import camera_steps, lidar_paths, pair_motions
 
@@ -29,7 +29,7 @@ def solve_hand_eye(problem: PeerProblem, start: gtsam.Pose3) -> gtsam.Pose3:
     """
     pairs = pair_motions(camera_steps([problem.drive]), lidar_paths([problem.drive]), problem.time_offset_s)
     if len(pairs) < _FEWEST:
-        raise EstimationError(f"{len(pairs)} pairs of motions, {_FEWEST} are needed")
+        raise EstimationError(f"{count_of(len(pairs), 'pair')} of motions, {_FEWEST} are needed")
     of_camera = np.array([camera.turned for camera in pairs.cameras])
     of_lidar = np.array([gtsam.Rot3.Logmap(gtsam.Rot3(aTb[:3, :3])) for aTb in pairs.lidars.aTbs])
     return gtsam.Pose3(park_martin(of_camera, of_lidar), start.translation())

@@ -10,6 +10,7 @@ from urllib.parse import quote
 
 import numpy as np
 
+from sst_graph.errors import count_of
 from sst_graph.fleet.drives import file_name
 from sst_graph.fleet.summary.tables import HUMAN, Row
 from sst_graph.fleet.vehicles.fused import Vehicle
@@ -39,7 +40,7 @@ def summary_html(rows: Sequence[Row], vehicle_rows: Sequence[Row], vehicles: Seq
         _drifts([by_name[str(row["vehicle"])] for row in vehicle_rows]),
         _drives(rows),
     ]
-    title = f"Batch of {len(rows)} drives"
+    title = f"Batch of {count_of(len(rows), 'drive')}"
     style = files("sst_graph.report").joinpath("page.css").read_text(encoding="utf-8")
     own = files("sst_graph.fleet.summary")
     script = own.joinpath("page.js").read_text(encoding="utf-8")
@@ -73,10 +74,12 @@ def _verdict(rows: Sequence[Row], vehicle_rows: Sequence[Row]) -> str:
     return section(
         "verdict",
         "Verdict",
-        f'<p class="verdict {state}">{counts["ok"]} of {len(rows)} drives {_verb(counts["ok"], "is", "are")} '
+        f'<p class="verdict {state}">{counts["ok"]} of {count_of(len(rows), "drive")} '
+        f"{_verb(counts['ok'], 'is', 'are')} "
         f"ok; {len(failed)} {_verb(len(failed), 'has', 'have')} no result"
         + (
-            f"; {len(wrong)} of {len(vehicle_rows)} vehicles {_verb(len(wrong), 'needs', 'need')} attention"
+            f"; {len(wrong)} of {count_of(len(vehicle_rows), 'vehicle')} "
+            f"{_verb(len(wrong), 'needs', 'need')} attention"
             if vehicle_rows
             else ""
         )
@@ -214,7 +217,7 @@ def _drifts(vehicles: Sequence[Vehicle]) -> str:
     """Charts of those with two drives or more."""
     moving = [one for one in vehicles if len(one.drift) > 1]
     blocks = [
-        details(f"{one.name}: {one.status}, {len(one.drives)} drives", grid(_charts(one)))
+        details(f"{one.name}: {one.status}, {count_of(len(one.drives), 'drive')}", grid(_charts(one)))
         for one in moving[:MOST_CHARTS]
     ]
     note = (

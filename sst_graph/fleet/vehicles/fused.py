@@ -213,6 +213,7 @@ def _tested(finding: Finding) -> dict[str, Any]:
 def _counted(drives: Sequence[Drive], records: Mapping[str, Record]) -> tuple[list[Drive], dict[str, str]]:
     """Drives with a result that can be fused, and why the others cannot."""
     counted, without = [], {}
+    owners: dict[str, str] = {}
     for drive in drives:
         record = records.get(drive.name)
         if record is None:
@@ -220,12 +221,17 @@ def _counted(drives: Sequence[Drive], records: Mapping[str, Record]) -> tuple[li
         elif record.status not in ("ok", "unobservable") or record.numbers is None:
             without[drive.name] = f"{record.status}: {record.reason}" if record.reason else record.status
         else:
+            hashes = record.numbers.scan_hashes
             try:
                 record.numbers.marginal()
             except EstimationError as error:
                 without[drive.name] = str(error)
-            else:
-                counted.append(drive)
+                continue
+            if twin := next((owners[one] for one in hashes if one in owners), None):
+                without[drive.name] = f"it holds scans of {twin}, which count once"
+                continue
+            owners.update(dict.fromkeys(hashes, drive.name))
+            counted.append(drive)
     return counted, without
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from sst_graph.association.time_pairing import pair_by_time
 from sst_graph.assumptions import named_sigmas
 from sst_graph.drive.preparation import Drive, boundary_count
-from sst_graph.errors import EstimationError
+from sst_graph.errors import EstimationError, count_of
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.building import (
     LOWER_EDGE_BIAS_SIGMA_PX,
@@ -217,7 +217,7 @@ def _solution(problem: _Problem, start: State, kernels_px: Sequence[float]) -> S
     names = [name for name, _ in named_sigmas(calibration.noise.estimate)]
     point = Point.of_state(state, calibration.classes, names)
     if not solution.converged:
-        message = f"the first solution still moved after {solution.outer_iterations} iterations"
+        message = f"the first solution still moved after {count_of(solution.outer_iterations, 'iteration')}"
         raise _NotConverged(message, _Solved(_cost(problem, point), point))
     if explained(solution) < MIN_EXPLAINED:
         share = f"{100.0 * explained(solution):.0f} %"
@@ -249,7 +249,9 @@ def _check_pairs(
         if drive.scans[pair.scan].boundaries and drive.images[pair.image].contours
     ]
     if pairs < _LEAST_PAIRS_SHARE * len(seen):
-        raise EstimationError(f"the first solution keeps {pairs} of {len(seen)} pairs of scan and image")
+        raise EstimationError(
+            f"the first solution keeps {pairs} of {count_of(len(seen), 'pair')} of scan and image"
+        )
     reach = config.calibration.search.time_offset_s
     if abs(time_offset_s - start_s) > reach:
         raise EstimationError(f"the time offset ran from {start_s:.3f} s to {time_offset_s:.3f} s")

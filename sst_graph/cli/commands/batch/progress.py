@@ -8,6 +8,7 @@ import time
 from tqdm import tqdm
 
 from sst_graph.cli.messages import complain
+from sst_graph.errors import count_of
 from sst_graph.fleet import Progress
 
 _LINE_EVERY_S = 30.0
@@ -58,7 +59,7 @@ class ProgressOnStderr:
 def first_line(progress: Progress) -> str:
     """What there is to do, in words."""
     earlier = f", {progress.earlier} of them done by an earlier run" if progress.earlier else ""
-    return f"{progress.total} drives{earlier}"
+    return f"{count_of(progress.total, 'drive')}{earlier}"
 
 
 def progress_line(progress: Progress) -> str:
@@ -66,7 +67,7 @@ def progress_line(progress: Progress) -> str:
     left = "" if progress.left_s is None else f", {_duration(progress.left_s)} left"
     failed = f", {progress.without_result} without result" if progress.without_result else ""
     rate = "" if progress.left_s is None else f", {progress.per_hour:.0f} an hour"
-    return f"{progress.done} of {progress.total} drives{failed}{rate}{left}"
+    return f"{progress.done} of {count_of(progress.total, 'drive')}{failed}{rate}{left}"
 
 
 def _duration(seconds: float) -> str:
