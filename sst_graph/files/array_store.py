@@ -29,6 +29,8 @@ that each is read in a tenth of a millisecond, and those of a long drive do not 
 _MAPPED_BYTES = 128 * 1024
 """Arrays of at least so many bytes are mapped: a match looks at a few hundred pixels of the 4 MB of a
 picture's gradients, and no more is read."""
+_ALIGNMENT = 64
+"""Arrays begin at multiples of so many bytes in the file."""
 
 
 class ArrayStore:
@@ -68,6 +70,8 @@ class ArrayStore:
         if not self._writable:
             return False
         data = array.reshape(-1).view(np.uint8).data
+        # NumPy copies the whole of an array that is not aligned to look up one value in it.
+        self._end += -self._end % _ALIGNMENT
         try:
             if self._file is None:
                 self._file = tempfile.TemporaryFile(prefix="sst-graph-", buffering=0)  # noqa: SIM115
