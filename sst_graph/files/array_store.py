@@ -71,20 +71,20 @@ class ArrayStore:
             return False
         data = array.reshape(-1).view(np.uint8).data
         # NumPy copies the whole of an array that is not aligned to look up one value in it.
-        self._end += -self._end % _ALIGNMENT
+        start = self._end + -self._end % _ALIGNMENT
         try:
             if self._file is None:
                 self._file = tempfile.TemporaryFile(prefix="sst-graph-", buffering=0)  # noqa: SIM115
             written = 0
             while written < len(data):
-                written += os.pwrite(self._file.fileno(), data[written:], self._end + written)
+                written += os.pwrite(self._file.fileno(), data[written:], start + written)
         except OSError as error:
             self._writable = False
             _LOG.warning(
                 "%s: %s: what is kept of the frames stays in memory", tempfile.gettempdir(), error.strerror
             )
             return False
-        self._end += len(data)
+        self._end = start + len(data)
         return True
 
     def read(self, start: int, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
