@@ -78,21 +78,23 @@ class PictureGradients:
         """
         smooth = cv2.GaussianBlur(picture, (0, 0), _BLUR_PX)
         gx, gy = (cv2.Scharr(smooth, cv2.CV_32F, *axis, scale=1.0 / 32.0) for axis in ((1, 0), (0, 1)))
-        # The structure tensor, summed over the colours, holds the change across every direction.
+        # The structure tensor, summed over the colours, holds the change across every direction: the square
+        # across the angle a is mean + half cos 2a + xy sin 2a, with half the difference of xx and yy.
         xx, xy, yy = (cv2.transform(a * b, np.ones((1, 3))) for a, b in ((gx, gx), (gx, gy), (gy, gy)))
         if valid is not None:
             seen = 1 - cv2.dilate((~valid).view(np.uint8), np.ones((7, 7), np.uint8))
             xx, xy, yy = (each * seen for each in (xx, xy, yy))
-        changes = [
-            np.sqrt(np.maximum(c * c * xx + 2.0 * c * s * xy + s * s * yy, 0.0, dtype=np.float32))
-            for c, s in zip(*_axes(), strict=True)
-        ]
+        mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
+        changes = []
+        for c, s in zip(*_double_angles(), strict=True):
+            square = np.add(cv2.addWeighted(half, c, xy, s, 0.0), mean)
+            changes.append(cv2.sqrt(np.maximum(square, 0.0, out=square)))
         around = (2 * (_AROUND_PX // 2) + 1,) * 2
-        mean = cv2.blur(sum(changes[1:], changes[0]), around) / np.float32(DIRECTIONS) + np.float32(_FLOOR)
-        per_mean = np.float32(UNIT) / mean
+        usual_change = cv2.blur(sum(changes[1:], changes[0]), around) / np.float32(DIRECTIONS)
+        per_mean = np.float32(UNIT) / (usual_change + np.float32(_FLOOR))
         height, width = picture.shape[:2]
         quarter, nearby = (-(-width // 4), -(-height // 4)), (2 * (_AROUND_PX // 8) + 1,) * 2
-        strengths = [cv2.convertScaleAbs(np.minimum(change * per_mean, 255.0)) for change in changes]
+        strengths = [cv2.multiply(change, per_mean, dtype=cv2.CV_8U) for change in changes]
         usual = [
             cv2.blur(cv2.resize(strength, quarter, interpolation=cv2.INTER_AREA), nearby)
             for strength in strengths
@@ -125,10 +127,10 @@ class PictureGradients:
         return shape_of(self, "strengths")
 
 
-def _axes() -> tuple[list[np.float32], list[np.float32]]:
-    """Cosines and sines of the directions."""
-    angles = np.arange(DIRECTIONS) * np.pi / DIRECTIONS
-    return [np.float32(c) for c in np.cos(angles)], [np.float32(s) for s in np.sin(angles)]
+def _double_angles() -> tuple[list[float], list[float]]:
+    """Cosines and sines of twice the directions' angles."""
+    angles = 2.0 * np.pi / DIRECTIONS * np.arange(DIRECTIONS)
+    return np.cos(angles).tolist(), np.sin(angles).tolist()
 
 
 def direction_numbers(directions: FloatArray) -> NDArray[np.intp]:
@@ -154,16 +156,14 @@ def profiles(
     found, usual = np.zeros((len(ts), len(uvs)), np.float32), np.zeros(len(uvs), np.float32)
     number = direction_numbers(outward)
     # 1. Where to look, for all pictures at once.
-    width, height = np.ones((2, len(uvs)), np.intp)
-    for each, (a, b) in zip(gradients, spans, strict=True):
-        width[a:b], height[a:b] = each.width, each.height
-    u, v = ts[:, None] * outward[:, 0], ts[:, None] * outward[:, 1]
-    u += uvs[:, 0]
-    v += uvs[:, 1]
-    np.clip(u, 0.0, width - 1.0, out=u)
-    np.clip(v, 0.0, height - 1.0, out=v)
-    v += number * height
-    u, v = u.astype(np.float32), v.astype(np.float32)
+    sizes = np.array([(each.width, each.height) for each in gradients], np.intp).reshape(-1, 2)
+    width, height = np.repeat(sizes, [b - a for a, b in spans], axis=0).T
+    distances, (u, v) = ts.astype(np.float32)[:, None], uvs.T.astype(np.float32)
+    across, down = outward.T.astype(np.float32)
+    u, v = u + distances * across, v + distances * down
+    np.clip(u, np.float32(0.0), (width - 1).astype(np.float32), out=u)
+    np.clip(v, np.float32(0.0), (height - 1).astype(np.float32), out=v)
+    v += (number * height).astype(np.float32)
     column, row = (uvs / 4.0).astype(np.intp).T
     quarter = -(-height // 4)
     column, row = np.clip(column, 0, -(-width // 4) - 1), np.clip(row, 0, quarter - 1)
@@ -219,14 +219,15 @@ def nearest_edges(
     width, height = np.repeat(np.array(sizes).reshape(-1, 2), [b - a for a, b in spans], axis=0).T
     valid = well_inside(uvs[:, 0], uvs[:, 1], width, height)
     safe = np.where(valid[:, None], uvs, 5.0)
-    mass = np.maximum(profiles(gradients, spans, safe, outward, ts), 0.0, dtype=np.float64)
+    mass = profiles(gradients, spans, safe, outward, ts)
+    np.maximum(mass, 0.0, out=mass)
     window = np.exp(-0.5 * (ts / scale_px) ** 2)
-    mass *= window[:, None]
     if place == "strongest":
         centre, strengths = _strongest(mass, ts, window)
         valid &= strengths > _LEAST_STRENGTH
         return GradientFeet(-centre, outward, safe + centre[:, None] * outward, valid, strengths / _MOST)
-    total, first, second = np.stack([np.ones_like(ts), ts, ts**2]) @ mass
+    moments = (np.stack([np.ones_like(ts), ts, ts**2]) * window).astype(np.float32)
+    total, first, second = (moments @ mass).astype(np.float64)
     centre = first / np.maximum(total, 1e-9)
     valid &= total * step > _LEAST_MASS
     shares = np.minimum(total * step / (_MOST * 2.0), 1.0)
@@ -238,13 +239,14 @@ def nearest_edges(
     return GradientFeet(-centre, outward, safe + centre[:, None] * outward, valid, shares)
 
 
-def _strongest(mass: FloatArray, ts: FloatArray, window: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(n,) distances of the edges with the greatest mass (m, n) [px], and (n,) their strengths, both without
-    the window (m,): strong edges are bounded, so that it would move them along their flat tops."""
-    best = mass.argmax(axis=0)
-    strengths = mass / window[:, None]
+def _strongest(strengths: FloatMap, ts: FloatArray, window: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(n,) distances of the edges of strengths (m, n) with the greatest mass under the window (m,) [px], and
+    (n,) their strengths, both without it: strong edges are bounded, so that it would move them along their
+    flat tops."""
+    ts = ts.astype(np.float32)
+    best = (strengths * window.astype(np.float32)[:, None]).argmax(axis=0)
     place = ts[best]
     for _ in range(_CENTRE_STEPS):
-        near = strengths * np.exp(-0.5 * ((ts[:, None] - place) / _EDGE_WIDTH_PX) ** 2)
-        place = ts @ near / np.maximum(near.sum(axis=0), 1e-9)
-    return place, strengths[best, np.arange(len(best))]
+        near = strengths * np.exp(np.float32(-0.5 / _EDGE_WIDTH_PX**2) * (ts[:, None] - place) ** 2)
+        place = ts @ near / np.maximum(near.sum(axis=0), np.float32(1e-9))
+    return place.astype(np.float64), strengths[best, np.arange(len(best))].astype(np.float64)

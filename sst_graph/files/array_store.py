@@ -31,6 +31,8 @@ that each is read in a tenth of a millisecond, and those of a long drive do not 
 _MAPPED_BYTES = 128 * 1024
 """Arrays of at least so many bytes are mapped: a match looks at a few hundred pixels of the 4 MB of a
 picture's gradients, and no more is read."""
+_ALIGNMENT = 64
+"""Arrays begin at multiples of so many bytes in the file."""
 
 
 class ArrayStore:
@@ -70,19 +72,21 @@ class ArrayStore:
         if not self._writable:
             return False
         data = array.reshape(-1).view(np.uint8).data
+        # NumPy copies the whole of an array that is not aligned to look up one value in it.
+        start = self._end + -self._end % _ALIGNMENT
         try:
             if self._file is None:
                 self._file = tempfile.TemporaryFile(prefix="sst-graph-", buffering=0)  # noqa: SIM115
             written = 0
             while written < len(data):
-                written += os.pwrite(self._file.fileno(), data[written:], self._end + written)
+                written += os.pwrite(self._file.fileno(), data[written:], start + written)
         except OSError as error:
             self._writable = False
             _LOG.warning(
                 "%s: %s: what is kept of the frames stays in memory", tempfile.gettempdir(), error.strerror
             )
             return False
-        self._end += len(data)
+        self._end = start + len(data)
         return True
 
     def read(self, start: int, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:

@@ -17,6 +17,7 @@ import gtsam
 import numpy as np
 import small_gicp
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from sst_graph.odometry.cloud import compensate_sweep, usable_points
@@ -268,7 +269,9 @@ class Window:
 
         def grouped(groups: IndexArray) -> SurfaceSums:
             order, first = _groups(groups)
-            return SurfaceSums(*(np.add.reduceat(values[order], first, axis=0) for values in stacked))
+            shape = len(first), len(order)
+            members = csr_array((np.ones(len(order)), order, np.append(first, len(order))), shape=shape)
+            return SurfaceSums(*(members @ values for values in stacked))
 
         directions = np.concatenate([rows.directions for rows in self._matches])
         return grouped(self._stacked()[0]), grouped(directions)
@@ -378,7 +381,7 @@ def _surfaces(points: FloatArray) -> _Surfaces:
         points = np.asarray(thinned.points())[:, :3].copy()
     if len(points) <= _NEIGHBOURS:
         return _Surfaces(*(np.zeros((0, 3)),) * 2, np.zeros(0), *(np.zeros(0, np.intp),) * 2)
-    _, near = cKDTree(points).query(points, k=_NEIGHBOURS)
+    near = np.asarray(small_gicp.KdTree(points).batch_knn_search(points, _NEIGHBOURS)[0], np.intp)
     values, vectors = np.linalg.eigh(_scatter(points, np.ascontiguousarray(near.T)))
     width = np.sqrt(np.maximum(values, 1e-12))
     flat = (width[:, 0] < _MAX_THICKNESS_RATIO * width[:, 1]) & (width[:, 1] > _MIN_WIDTH_RATIO * width[:, 2])
