@@ -75,15 +75,13 @@ class PictureEdges:
         u, v = np.concatenate(contour_pixels(inside)).T
         height, width = (side // 2 + side % 2 for side in inside.shape)
         # At half the size: shifts vary slowly along a contour, and this takes most of the time.
-        cells = (v // 2) * width + u // 2
-        counts = np.bincount(cells, minlength=height * width).reshape(height, width)
-        sums = np.bincount(cells, self.shifts, minlength=height * width).reshape(height, width)
-        away = (counts == 0).view(np.uint8)
+        half_u, half_v = u // 2, v // 2
+        away = np.ones((height, width), np.uint8)
+        away[half_v, half_u] = 0
         labels = cv2.distanceTransformWithLabels(away, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[1]
-        by_label = np.zeros(int(labels.max()) + 1, np.float32)
-        on = counts > 0
-        by_label[labels[on]] = sums[on] / counts[on]
-        smooth = cv2.GaussianBlur(by_label[labels], (0, 0), 0.5 * _SMOOTHING_PX)
+        cells = labels[half_v, half_u]
+        means = np.bincount(cells, self.shifts) / np.maximum(np.bincount(cells), 1)
+        smooth = cv2.GaussianBlur(means.astype(np.float32).take(labels), (0, 0), 0.5 * _SMOOTHING_PX)
         shifts = cv2.resize(smooth, (2 * width, 2 * height))[: inside.shape[0], : inside.shape[1]]
         unseen = np.zeros(inside.shape, np.uint8)
         unseen[v[~self.seen], u[~self.seen]] = 1

@@ -103,7 +103,8 @@ class ContourMap:
         top, left = max(0, y - REACH_PX), max(0, x - REACH_PX)
         part = slice(top, y + height + REACH_PX), slice(left, x + width + REACH_PX)
         box = np.ascontiguousarray(inside[part])
-        distance = np.asarray(cv2.GaussianBlur(signed_distance(box), (0, 0), _SMOOTHING_PX), np.float32)
+        distance = signed_distance(box)
+        cv2.GaussianBlur(distance, (0, 0), _SMOOTHING_PX, dst=distance)
         ignored = (mask[part] == int(SemanticClass.IGNORE)).view(np.uint8)
         unknown = np.asarray(cv2.dilate(ignored, _BESIDE), np.uint8)
         if edges is None and picture is not None and picture.shape[:2] == mask.shape:

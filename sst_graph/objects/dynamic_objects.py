@@ -216,10 +216,10 @@ class DynamicObjectTest:
 
     def _set_path_speed(self, detection: Detection, speed: float) -> None:
         before = self._path_speed(detection)
-        speeds = self.path_speeds.setdefault(detection.scan, {})
-        speeds.pop(detection.name, None)
         if speed > 0.0:
-            speeds[detection.name] = speed
+            self.path_speeds.setdefault(detection.scan, {})[detection.name] = speed
+        elif before > 0.0:
+            del self.path_speeds[detection.scan][detection.name]
         if abs(speed - before) > _SPEED_CHANGE * max(speed, before):
             self.changed_scans.add(detection.scan)
 

@@ -76,7 +76,6 @@ class ObjectVelocities:
 
     def __init__(self) -> None:
         self._scans: dict[int, _ScanOutlines] = {}
-        self._detections: dict[int, dict[int, ObjectName]] = {}
         self.found: dict[int, dict[int, ObjectVelocity]] = {}
 
     def add(
@@ -98,8 +97,6 @@ class ObjectVelocities:
     ) -> None:
         """Keep a scan's outlines."""
         self._scans[number] = _ScanOutlines.of(scan, tracks, wTl)
-        for name, track in self._scans[number].tracks.items():
-            self._detections.setdefault(track, {})[number] = name
 
     def update_all(self) -> None:
         """Estimate the velocities in all scans, from all scans."""
@@ -110,10 +107,9 @@ class ObjectVelocities:
         """Drop all scans before one."""
         for old in [k for k in self._scans if k < before]:
             for track in self._scans.pop(old).tracks.values():
-                for by_track in (self._detections, self.found):
-                    by_track.get(track, {}).pop(old, None)
-                    if not by_track.get(track, True):
-                        del by_track[track]
+                self.found.get(track, {}).pop(old, None)
+                if not self.found.get(track, True):
+                    del self.found[track]
 
     def of(self, number: int, name: ObjectName) -> ObjectVelocity | None:
         """Velocity of an object of a scan, or None where it is not followed well enough."""
@@ -152,7 +148,7 @@ class ObjectVelocities:
             found, known = self._estimate(number, name), self.found.setdefault(track, {})
             if (found is None) == (number in known):
                 known.pop(number, None)
-                near = [k for k in self._around(number, _MEMORY_S) if k in self._detections[track]]
+                near = [k for k in self._around(number, _MEMORY_S) if track in self._scans[k].names]
                 changed |= {k for k in near if not self._known_near(track, k)}
             if found is not None:
                 known[number] = found
@@ -162,10 +158,11 @@ class ObjectVelocities:
 
     def _estimate(self, number: int, name: ObjectName) -> ObjectVelocity | None:
         here = self._scans[number]
-        detections = self._detections[here.tracks[name]]
-        near = [(k, detections[k]) for k in self._around(number, _WINDOW_S) if k in detections]
-        few = len(here.outlines[name]) < _MIN_POINTS
-        if few or len(near) < _MIN_DETECTIONS:
+        if len(here.outlines[name]) < _MIN_POINTS:
+            return None
+        names = {k: self._scans[k].names.get(here.tracks[name]) for k in self._around(number, _WINDOW_S)}
+        near = [(k, own) for k, own in names.items() if own is not None]
+        if len(near) < _MIN_DETECTIONS:
             return None
         times_s = np.array([1e-9 * (self._scans[k].stamp_ns - here.stamp_ns) for k, _ in near])
         centres = np.array([self._scans[k].centres[own] for k, own in near])
@@ -198,7 +195,8 @@ def _is_carried(
 
 @dataclass(frozen=True)
 class _ScanOutlines:
-    """A scan: stamp, pose, the LiDAR's place (2,); outlines (n, 2), centres, tracks of movable objects."""
+    """A scan: stamp, pose, the LiDAR's place (2,); outlines (n, 2), centres, tracks of movable objects, and
+    their names by track."""
 
     stored_apart: ClassVar[bool] = True
 
@@ -208,6 +206,7 @@ class _ScanOutlines:
     outlines: dict[ObjectName, FloatArray]
     centres: dict[ObjectName, tuple[float, float]]
     tracks: dict[ObjectName, int]
+    names: dict[int, ObjectName]
 
     @classmethod
     def of(cls, scan: ScanFeatures, tracks: Mapping[ObjectName, int], wTl: gtsam.Pose3) -> _ScanOutlines:
@@ -225,7 +224,8 @@ class _ScanOutlines:
         followed = {name: outline for name, outline in outlines.items() if name in tracks}
         own = {name: tracks[name] for name in followed}
         centres = {name: tuple((part.sum(axis=0) / len(part)).tolist()) for name, part in followed.items()}
-        return cls(scan.stamp_ns, wTl, np.asarray(wTl.translation()[:2]), followed, centres, own)
+        names = {track: name for name, track in own.items()}
+        return cls(scan.stamp_ns, wTl, np.asarray(wTl.translation()[:2]), followed, centres, own, names)
 
 
 def velocities_of_points(

@@ -137,7 +137,7 @@ def test_what_is_known_grows_with_the_scans_around_and_is_forgotten() -> None:
     velocities.found[7][9] = late
     assert velocities.of(9, NAME) is late and velocities.speeds(10)[NAME] == pytest.approx(9 / 1.0)
     velocities.forget(12)
-    assert not (velocities._scans or velocities._detections or velocities.found)
+    assert not (velocities._scans or velocities.found)
 
 
 def test_a_scan_whose_objects_show_no_side() -> None:
