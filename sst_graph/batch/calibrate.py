@@ -11,7 +11,12 @@ import gtsam
 
 from sst_graph.baselines.semalign import solve_semalign
 from sst_graph.baselines.sst_calib import solve_paper, solve_static
-from sst_graph.batch.assumption_tests import assumption_report, contradiction_sentence, examine_assumptions
+from sst_graph.batch.assumption_tests import (
+    ParameterTest,
+    assumption_report,
+    contradiction_sentence,
+    examine_assumptions,
+)
 from sst_graph.batch.baselines import baseline_method
 from sst_graph.batch.by_edges.both import both_method
 from sst_graph.batch.by_edges.choice import with_method_for, with_method_of
@@ -19,7 +24,7 @@ from sst_graph.batch.by_edges.lens import lens_beside_labels
 from sst_graph.batch.by_edges.method import edges_method
 from sst_graph.batch.causes import with_causes
 from sst_graph.batch.config import CalibrationConfig, Method, prepared_classes
-from sst_graph.batch.contradictions import find_contradictions
+from sst_graph.batch.contradictions import Contradictions, find_contradictions
 from sst_graph.batch.joint_report import (
     fit_of,
     joint_diagnostics,
@@ -223,7 +228,7 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
         solution.state.time_offsets_s[0],
         total.covariance,
         frames_used(drives, solution),
-        (*contradiction_sentence(tests), *wrong, *contradictions.sentences, *motion.reasons, *total.reasons),
+        (*_contradicted(tests, contradictions, wrong), *motion.reasons, *total.reasons),
         (*unknown_motion_remarks(drives), *motion.remarks),
         motion.estimate.by_static_objects[:7, :7],
         drive_offsets(drives, solution.state, unknowns),
@@ -242,6 +247,20 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
         by_sweeps=total.by_sweeps,
         sweep_reasons=total.reasons,
     )
+
+
+def _contradicted(
+    tests: Sequence[ParameterTest], contradictions: Contradictions, wrong: Sequence[str]
+) -> tuple[str, ...]:
+    """What the data contradict and what else is wrong, the most important first.
+
+    A step within a drive looks like an assumption that is broken by a little at all times (a clock that was
+    set, like one that runs fast), and the other way round: the one that explains more is said first.
+    """
+    assumptions = contradiction_sentence(tests)
+    if assumptions and contradictions.step_chi2 > tests[0].score ** 2:
+        return (*contradictions.sentences, *assumptions, *wrong)
+    return (*assumptions, *wrong, *contradictions.sentences)
 
 
 _Method = Callable[[Sequence[Drive], Guess, CalibrationConfig, Progress | None], MethodEstimate]

@@ -41,11 +41,13 @@ class Contradictions:
     Attributes:
         sentences: one for each contradiction.
         stretches: the stretches, each solved by itself.
+        step_chi2: of the longest step within a drive; 0 without one.
         diagnostics: JSON-able numbers.
     """
 
     sentences: tuple[str, ...] = ()
     stretches: tuple[SolvedPart, ...] = ()
+    step_chi2: float = 0.0
     diagnostics: dict[str, Any] = field(default_factory=dict)
 
 
@@ -74,7 +76,8 @@ def find_contradictions(parts: PartSolver) -> Contradictions:
         "within": [_step_document(parts, step) for step in steps],
         "between": {parts.drives[n].name: _difference_document(d) for n, d in against.items()},
     }
-    return Contradictions(tuple(sentences), tuple(s for own in stretches for s in own), diagnostics)
+    chi2 = max((step.difference.chi2 for step in steps), default=0.0)
+    return Contradictions(tuple(sentences), tuple(s for own in stretches for s in own), chi2, diagnostics)
 
 
 def _cut(scans: int) -> list[tuple[int, ...]]:
