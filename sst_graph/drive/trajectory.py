@@ -14,6 +14,7 @@ from sst_graph.odometry.standstill import ZeroVelocityUpdate
 from sst_graph.types import RelativeMotion
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -52,11 +53,12 @@ class TwistSamples:
 
 
 class TwistTrack:
-    """Twists over time: linear between the middles of the measured intervals,
-    carried on for half an interval beyond the ends, constant from there.
+    """Twists over time: cubics between the middles of the measured intervals, carried on for half an interval
+    beyond the ends, constant from there.
 
-    The mean twist over an interval equals the twist at its middle up to the third derivative of the
-    motion, so two intervals give twist and acceleration at the stamp between them.
+    At each middle, twist and acceleration are those of the parabola whose means over the interval and its two
+    neighbours are the measured ones. Straight lines through the means would be 15 % short of a pitching
+    at 1.5 Hz that is seen at 10 Hz; these are 2 % short.
     """
 
     def __init__(self, motions: Sequence[RelativeMotion]) -> None:
@@ -80,18 +82,49 @@ class TwistTrack:
         i = np.clip(np.searchsorted(self._middles, t) - 1, 0, n - 2)
         used, place = np.unique(np.concatenate([i, i + 1]), return_inverse=True)
         place = place.reshape(2, k)
-        known = [self._motions[number] for number in used.tolist()]
-        before, after = np.array([motion.mean_twist for motion in known]).reshape(-1, 6)[place]
+        twists, rates = self._at_middles(used)
+        (before, after), (rate_before, rate_after) = twists[place], rates[place]
         spans = self._middles[i + 1] - self._middles[i]
-        slopes = (after - before) / spans[:, None]
         fractions = np.minimum(np.maximum((t - self._middles[i]) / spans, -0.5), 1.5)
+        u = np.minimum(np.maximum(fractions, 0.0), 1.0)[:, None]
+        h = spans[:, None]
+        slopes = (after - before) / h
+        # The cubic of Hermite, and its derivative.
+        value = before + u * h * (slopes + (1.0 - u) * _bend(u, slopes, rate_before, rate_after))
+        rate = (1.0 - u) * (1.0 - 3.0 * u) * rate_before + u * (3.0 * u - 2.0) * rate_after
+        rate += 6.0 * u * (1.0 - u) * slopes
         # As if both errors were equal, as they nearly are for smoothed motions.
         weights = np.abs([1.0 - fractions, fractions])[:, :, None, None]
-        covariances = np.array([_covariance(motion) for motion in known])[place]
+        covariances = np.array([_covariance(self._motions[number]) for number in used.tolist()])[place]
         total = weights[0] * covariances[0] + weights[1] * covariances[1]
-        beyond = np.maximum(np.maximum(-fractions, fractions - 1.0), 0.0)
-        total[:, _AXES, _AXES] += (slopes * (spans * beyond)[:, None]) ** 2
-        return TwistSamples(before + (fractions * spans)[:, None] * slopes, slopes, total)
+        beyond = (fractions - u[:, 0]) * spans
+        total[:, _AXES, _AXES] += (rate * beyond[:, None]) ** 2
+        return TwistSamples(value + rate * beyond[:, None], rate, total)
+
+    def _at_middles(self, numbers: IntArray) -> tuple[FloatArray, FloatArray]:
+        """(k, 6) twists and (k, 6) accelerations at the middles of some intervals: by the cubic of the pose
+        through four stamps, in the manner of Newton; of the first and the last interval by a parabola."""
+        last = len(self._motions) - 1
+        around = np.clip(numbers[:, None] + [-1, 0, 1], 0, last)
+        needed, place = np.unique(around, return_inverse=True)
+        known = [self._motions[number] for number in needed.tolist()]
+        means = np.array([motion.mean_twist for motion in known])[place.reshape(around.shape)]
+        h = np.array([motion.seconds for motion in known])[place.reshape(around.shape)][..., None]
+        before = (means[:, 1] - means[:, 0]) / (h[:, 0] + h[:, 1])
+        after = (means[:, 2] - means[:, 1]) / (h[:, 1] + h[:, 2])
+        inner = (numbers > 0) & (numbers < last)
+        third = np.where(inner[:, None], (after - before) / h.sum(axis=1), 0.0)
+        before = np.where((numbers == 0)[:, None], after, before)
+        still = ~means[:, 1].any(axis=1)
+        twists = means[:, 1] - 0.25 * h[:, 1] ** 2 * third
+        rates = 2.0 * before + third * (2.0 * h[:, 0] + h[:, 1])
+        twists[still], rates[still] = 0.0, 0.0
+        return twists, rates
+
+
+def _bend(u: FloatArray, slopes: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
+    """What a cubic between two values, of given rates there, has beyond the straight line, over u (1 - u)."""
+    return np.asarray((1.0 - u) * (before - slopes) - u * (after - slopes))
 
 
 _AXES = np.arange(6)

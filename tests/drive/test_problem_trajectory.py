@@ -72,10 +72,34 @@ def test_many_stamps_at_once_are_each_by_itself(count: int) -> None:
         np.testing.assert_allclose(found.twists[k], one.twist, rtol=1e-12)
         np.testing.assert_allclose(found.accelerations[k], one.acceleration, rtol=1e-12)
         np.testing.assert_allclose(found.covariances[k], one.covariance, rtol=1e-12)
-    # Linear between the middles of two intervals.
-    if count > 1:
-        early, late = (track.at(EPOCH_NS + round(t * 1e9)).twist for t in (0.05, 0.16))
-        np.testing.assert_allclose(track.at(EPOCH_NS + 105_000_000).twist, 0.5 * (early + late), rtol=1e-9)
+
+
+def test_a_pitching_that_is_just_seen_is_followed() -> None:
+    """1.5 Hz at 10 Hz: straight lines through the means of the intervals are 15 % short at the stamps."""
+    turned = 2.0 * np.pi * 1.5
+    track = TwistTrack(motions(np.arange(0.0, 2.01, 0.1).tolist(), lambda t: np.sin(turned * t) / turned))
+    times = np.arange(0.4, 1.6, 0.013)
+    found = track.at_all([EPOCH_NS + round(t * 1e9) for t in times])
+    expected = SCREW * np.cos(turned * times)[:, None]
+    assert np.abs(found.twists - expected).max() < 0.025 * np.abs(SCREW).max()
+    rates = -turned * SCREW * np.sin(turned * times)[:, None]
+    assert np.abs(found.accelerations - rates).max() < 0.15 * turned * np.abs(SCREW).max()
+
+
+def test_exact_under_a_steady_jerk_where_neighbours_are_known() -> None:
+    stamps = [0.0, 0.1, 0.22, 0.3, 0.41, 0.5]
+    track = TwistTrack(motions(stamps, lambda t: 2.0 * t + t**3))
+    for t in (0.16, 0.2, 0.25, 0.3):
+        sample = track.at(EPOCH_NS + round(t * 1e9))
+        np.testing.assert_allclose(sample.twist, SCREW * (2.0 + 3.0 * t**2), atol=1e-6)
+        np.testing.assert_allclose(sample.acceleration, SCREW * 6.0 * t, atol=1e-5)
+
+
+def test_standstill_stays_exactly_still() -> None:
+    stamps = np.arange(0.0, 1.01, 0.1).tolist()
+    track = TwistTrack(motions(stamps, lambda t: max(t - 0.5, 0.0) ** 2))
+    before = [EPOCH_NS + round(t * 1e9) for t in (0.05, 0.2, 0.33, 0.4, 0.45)]
+    assert not track.at_all(before).twists.any()
 
 
 def test_a_single_motion_is_held() -> None:
