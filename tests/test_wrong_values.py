@@ -67,5 +67,5 @@ def test_what_results_refuse() -> None:
             dataclasses.replace(result, **change)
     with pytest.raises(ConfigError, match="next_frames: found the text 'ten', expected at least 1"):
         inspect_result(result, "ten")  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match="loader: found 5, expected a text"):
+    with pytest.raises(ConfigError, match="loader: found 5, expected the name"):
         open_source(".", loader=5)  # type: ignore[arg-type]

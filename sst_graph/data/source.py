@@ -225,7 +225,7 @@ def open_source(
         ConfigError: an option that is unknown or out of range.
     """
     if not isinstance(loader, str):
-        raise ConfigError(f"loader: found {described(loader)}, expected a text such as 'auto'")
+        raise ConfigError(f"loader: found {described(loader)}, expected the name of a format")
     unknown = [name for name in options if name not in ReadOptions.__annotations__]
     if unknown:
         known = ", ".join(("loader", "frames", *ReadOptions.__annotations__))

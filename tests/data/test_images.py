@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 
 from sst_graph.data.decoder_output import decoder_output
 from sst_graph.data.images import picture_size, read_instances, read_mask, read_picture
@@ -176,3 +177,15 @@ def test_a_process_without_stderr_reads_pictures_too(tmp_path: Path) -> None:
         f"import os; os.close(2)\nfrom sst_graph.data.images import read_picture\nread_picture({str(path)!r})"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_palette_of_colours_is_named(tmp_path: Path) -> None:
+    """As segmentation tools write masks for the eye; a palette of grey values is read as these."""
+    mask = Image.fromarray(np.array([[0, 1], [2, 1]], np.uint8), "P")
+    mask.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0])
+    mask.save(tmp_path / "mask.png")
+    with pytest.raises(DataError, match=r"mask\.png: found a palette of colours, expected one channel"):
+        read_mask(tmp_path / "mask.png")
+    mask.putpalette([7, 7, 7, 8, 8, 8, 9, 9, 9])
+    mask.save(tmp_path / "grey.png")
+    np.testing.assert_array_equal(read_mask(tmp_path / "grey.png"), [[7, 8], [9, 8]])
