@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
+from sst_graph.factors.arguments import checked_type
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.files.checked_values import check_covariance, check_finite, checked_text, pinhole_camera
 from sst_graph.files.json_table import JsonTable, json_table
@@ -90,6 +91,15 @@ class Sigmas:
     time_offset_ms: float
 
 
+_SEVERAL = {
+    "reasons": str,
+    "weak_directions": WeakDirection,
+    "frames_used": FrameId,
+    "drive_offsets": DriveOffset,
+}
+"""Fields of a result that hold several, and of what type."""
+
+
 @dataclass(frozen=True, eq=False)
 class CalibrationResult:
     """An estimated extrinsic and time offset, and how far to trust them. Signs: :mod:`factors`.
@@ -140,7 +150,17 @@ class CalibrationResult:
     edges_fit: Fit | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        _check_status(self.status)
+        check_status(self.status)
+        checked_type("T_camera_lidar", self.T_camera_lidar, gtsam.Pose3, "a gtsam.Pose3")
+        checked_type("camera", self.camera, PinholeCamera, "a PinholeCamera")
+        checked_type("camera_name", self.camera_name, str, "a text")
+        for name, kind in _SEVERAL.items():
+            several = getattr(self, name)
+            checked_type(name, several, (tuple, list), f"a tuple of {kind.__name__}")
+            for one in several:
+                checked_type(f"one of {name}", one, kind, f"a {kind.__name__}")
+        for name in ("config", "read_as", "diagnostics", "versions"):
+            checked_type(name, getattr(self, name), Mapping, "a dict")
         check_finite("T_camera_lidar", self.T_camera_lidar.matrix(), (4, 4))
         check_finite("time_offset_s", np.asarray(self.time_offset_s), ())
         check_finite("covariance", self.covariance, (7, 7))
@@ -285,8 +305,13 @@ def file_of_one_camera(path: Path) -> Path:
     return file
 
 
-def _check_status(status: str) -> None:
-    if status not in get_args(Status):
+def check_status(status: object) -> None:
+    """Refuse what is no :data:`Status`.
+
+    Raises:
+        DataError: it is none.
+    """
+    if not (isinstance(status, str) and status in get_args(Status)):
         raise DataError("status", f"{status!r:.60}", "one of " + ", ".join(get_args(Status)))
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from sst_graph.cli import EXIT_NOT_TRUSTED
-from sst_graph.cli.messages import complain
+from sst_graph.cli.messages import complain, loudness
 from sst_graph.cli.pictures import ShownFrame, overlay, png, telling_positions
 from sst_graph.cli.progress import ProgressBar, ProgressStage
 from sst_graph.data.frame_parts import RecentReader
@@ -133,7 +133,8 @@ def exit_code(result: CalibrationResult) -> int:
 def why_not_ok(result: CalibrationResult) -> str:
     """Status and first reason of a result that is not ok, in one line."""
     first, *others = short_reasons(result) or ("the result carries no reason",)
-    more = f" ({len(others)} more in the summary; in full in the report)" if others else ""
+    where = "in the report" if loudness.quiet else "in the summary; in full in the report"
+    more = f" ({len(others)} more {where})" if others else ""
     return f"{result.status}: {first}{more}"
 
 

@@ -30,7 +30,10 @@ _PREFIXES = (
 )
 """How the decoders' lines begin."""
 
-_lock = threading.Lock()
+_lock = threading.RLock()
+if hasattr(os, "register_at_fork"):
+    # No fork while a thread decodes: the child would wait for a lock that nobody opens, and have no stderr.
+    os.register_at_fork(before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_lock.release)
 
 
 @contextmanager

@@ -26,6 +26,7 @@ MAX_PIXELS = 50_000_000
 Size = tuple[int, int]
 """Width, height [px]."""
 
+_PNG, _COLOUR_TYPE, _OF_PALETTE = b"\x89PNG", 25, b"\x03"
 _PADDING = "extraneous bytes before marker 0xd9"
 """What libjpeg says of padding before the end, as some cameras write it: no pixel is missing."""
 
@@ -71,7 +72,7 @@ def decoded_mask(data: bytes, place: str | Path) -> NDArray[np.uint8]:
     Raises:
         DataError: as :func:`read_mask`.
     """
-    return _as_mask(_one_channel(_decoded(data, cv2.IMREAD_UNCHANGED, place, None), place), place)
+    return _as_mask(_one_channel(_decoded(data, cv2.IMREAD_UNCHANGED, place, None), data, place), place)
 
 
 def read_mask(path: Path, size: Size | None = None) -> NDArray[np.uint8]:
@@ -110,14 +111,18 @@ def read_instances(path: Path, size: Size | None = None) -> NDArray[np.uint16]:
 
 
 def _single_channel(path: Path, size: Size | None) -> NDArray[Any]:
-    return _one_channel(_decode(path, cv2.IMREAD_UNCHANGED, size), path)
+    data = read_file(path, IMAGE)
+    return _one_channel(_decoded(data, cv2.IMREAD_UNCHANGED, path, size), data, path)
 
 
-def _one_channel(image: NDArray[Any], place: str | Path) -> NDArray[Any]:
+def _one_channel(image: NDArray[Any], data: bytes, place: str | Path) -> NDArray[Any]:
     if image.ndim == 3:
         channels = image[:, :, :3]
         if (channels != channels[:, :, :1]).any():
-            raise DataError(place, f"{image.shape[2]} channels that differ", "one channel of class numbers")
+            found = f"{image.shape[2]} channels that differ"
+            if data.startswith(_PNG) and data[_COLOUR_TYPE : _COLOUR_TYPE + 1] == _OF_PALETTE:
+                found = "a palette of colours"
+            raise DataError(place, found, "one channel of class numbers, without colours")
         image = channels[:, :, 0]
     return np.ascontiguousarray(image)
 

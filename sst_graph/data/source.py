@@ -85,14 +85,14 @@ class SourceOptions:
                 raise ConfigError(f"{found}: found a NUL character, expected none")
         if abs(self.image_shift) >= _MOST_FRAMES:
             raise ConfigError(f"image shift {described(self.image_shift)}: expected a number of frames")
-        if self.label_encoding not in LABEL_ENCODINGS:
-            raise ConfigError(f"label encoding {self.label_encoding!r}: expected one of {LABEL_ENCODINGS}")
-        if self.sweep not in SWEEPS:
-            raise ConfigError(f"sweep {self.sweep!r}: expected one of {SWEEPS}")
-        if self.sweep_stamp not in get_args(SweepStamp):
-            raise ConfigError(f"sweep stamp {self.sweep_stamp!r}: expected one of {get_args(SweepStamp)}")
-        if self.stamps not in STAMPS:
-            raise ConfigError(f"stamps {self.stamps!r}: expected one of {STAMPS}")
+        for what, choice, choices in (
+            ("label encoding", self.label_encoding, LABEL_ENCODINGS),
+            ("sweep", self.sweep, SWEEPS),
+            ("sweep stamp", self.sweep_stamp, get_args(SweepStamp)),
+            ("stamps", self.stamps, STAMPS),
+        ):
+            if not (isinstance(choice, str) and choice in choices):
+                raise ConfigError(f"{what} {choice!r:.60}: expected one of {choices}")
         if not -360.0 <= self.sweep_start_deg <= 360.0:
             raise ConfigError(f"sweep start {self.sweep_start_deg} deg: expected -360 to 360")
         if self.frames is not None:
@@ -224,6 +224,8 @@ def open_source(
         DataError: nothing there, or data that cannot be used.
         ConfigError: an option that is unknown or out of range.
     """
+    if not isinstance(loader, str):
+        raise ConfigError(f"loader: found {described(loader)}, expected the name of a format")
     unknown = [name for name in options if name not in ReadOptions.__annotations__]
     if unknown:
         known = ", ".join(("loader", "frames", *ReadOptions.__annotations__))

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
+from sst_graph.factors.arguments import described
 from sst_graph.factors.camera import PinholeCamera
 
 FloatArray = NDArray[np.float64]
@@ -34,11 +35,13 @@ MAX_PIXEL_ASPECT = 5.0
 
 
 def check_finite(place: str, array: FloatArray, shape: tuple[int, ...]) -> None:
-    """Require a shape, and finite values.
+    """Require an array of numbers, a shape, and finite values.
 
     Raises:
         DataError: naming ``place``.
     """
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "iuf":
+        raise DataError(place, described(array), f"an array of numbers of shape {shape}")
     if array.shape != shape:
         raise DataError(place, f"shape {array.shape}", f"shape {shape}")
     if not np.isfinite(array).all():

@@ -158,6 +158,8 @@ def parse_json(text: str, place: str | Path, expected: str = "JSON", max_depth: 
             ``max_depth`` levels or MAX_VALUES values, a number of more than MAX_NUMBER_LENGTH characters or
             MAX_DIGITS digits, a string with half a character (a lone surrogate).
     """
+    if not isinstance(text, str):
+        raise DataError(place, f"a {type(text).__name__}", f"{expected} as text")
     if text.count(",") + text.count("[") + text.count("{") > MAX_VALUES:
         raise DataError(place, "too many values", f"{expected} with at most {MAX_VALUES}")
 

@@ -51,7 +51,7 @@ def matches(value: Any, hint: Any) -> bool:
     if origin in (Union, types.UnionType):
         return any(matches(value, choice) for choice in arguments)
     if origin is Literal:
-        return any(value == choice and type(value) is type(choice) for choice in arguments)
+        return any(type(value) is type(choice) and value == choice for choice in arguments)
     if origin is np.ndarray:
         return isinstance(value, np.ndarray) and _matches_dtype(value.dtype, arguments)
     if origin is tuple:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sst_graph.covariance.observability import ObservabilityConfig, weak_directions
 from sst_graph.errors import ConfigError, DataError
+from sst_graph.factors.arguments import described, is_whole
 from sst_graph.inspect.frame_information import KEY, FrameInformation, frames_of
 from sst_graph.inspect.gained import Gained, gained_of
 from sst_graph.inspect.pixels import pixel_covariance
@@ -123,9 +124,9 @@ def inspect_result(result: CalibrationResult, next_frames: int = 10) -> Inspecti
     """
     if not isinstance(result, CalibrationResult):
         raise DataError("result", f"a {type(result).__name__}", "a CalibrationResult (read_result)")
-    if not 1 <= next_frames <= MOST_NEXT_FRAMES:
+    if not (is_whole(next_frames) and 1 <= next_frames <= MOST_NEXT_FRAMES):
         expected = f"at least 1 and at most {MOST_NEXT_FRAMES}"
-        raise ConfigError(f"next_frames: found {next_frames}, expected {expected}")
+        raise ConfigError(f"next_frames: found {described(next_frames)}, expected {expected}")
     frames = frames_of(result)
     limits = limits_of(result)
     return Inspection(

@@ -11,17 +11,18 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import ConfigError, DataError, count_of
+from sst_graph.factors.arguments import checked_type
 from sst_graph.files.checked_values import check_covariance, check_finite
 from sst_graph.files.json_table import JsonTable, json_table
 from sst_graph.files.reading import FileKind, parse_json, path_of, read_text
 from sst_graph.files.strict_json import strict_json
-from sst_graph.result import CALIBRATION_NAME, RIG_NAME, CalibrationResult, Status, read_result
+from sst_graph.result import CALIBRATION_NAME, RIG_NAME, CalibrationResult, Status, check_status, read_result
 from sst_graph.rig.known import KnownPose, KnownRig
 from sst_graph.rig.marginal import RelativePose, RigMarginal
 
@@ -60,9 +61,13 @@ class RigResult:
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        checked_type("cameras", self.cameras, Mapping, "a dict of results by the camera's name")
+        for name, camera in self.cameras.items():
+            checked_type("name of a camera", name, str, "a text")
+            checked_type(f"calibration of {name:.60}", camera, CalibrationResult, "a CalibrationResult")
+        checked_type("known", self.known, KnownRig, "a KnownRig")
         n = 7 * len(self.cameras)
-        if self.status not in get_args(Status):
-            raise DataError("status", f"{self.status!r:.60}", "one of " + ", ".join(get_args(Status)))
+        check_status(self.status)
         check_finite("covariance", self.covariance, (n, n))
         check_covariance("covariance", self.covariance, min_sigma=0.0)
 

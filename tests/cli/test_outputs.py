@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import shutil
@@ -10,8 +11,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from calibrations import turned
 
 from sst_graph.cli import main
+from sst_graph.cli.messages import loudness
+from sst_graph.cli.outputs import why_not_ok
 from sst_graph.result import read_result
 from sst_graph.simulator import SimulationConfig, simulate, write_drive
 
@@ -246,3 +250,11 @@ def test_a_place_where_nothing_can_be_made(
 @pytest.mark.parametrize("frames", ["0", "-1", "100001", str(10**18), str(10**400)])
 def test_frames_of_a_prediction_are_bounded(capsys: pytest.CaptureFixture[str], frames: str) -> None:
     assert "expected 1 or more, at most 100000" in _refused(capsys, "inspect", "none", "--next", frames)
+
+
+def test_where_further_reasons_stand(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With --quiet there is no summary."""
+    result = dataclasses.replace(turned(3), status="not_converged", reasons=("one", "two"))
+    assert why_not_ok(result) == "not_converged: one (1 more in the summary; in full in the report)"
+    monkeypatch.setattr(loudness, "quiet", True)
+    assert why_not_ok(result) == "not_converged: one (1 more in the report)"

@@ -15,6 +15,7 @@ from sst_graph.cameras import BrownConradyCamera
 from sst_graph.cli import main
 from sst_graph.data import open_source
 from sst_graph.data.folder.camera_file import read_camera
+from sst_graph.data.folder.stamps import stamped_files
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.sweep_timing import SweepTiming
 
@@ -229,6 +230,33 @@ def test_stamps_in_a_table_and_files_that_are_not_in_it(folder: Path) -> None:
     (folder / "images.csv").write_text("\n".join(["name,stamp_ns", *lines]) + "\n")
     stamps = [frame.image.stamp_ns for frame in open_source(folder) if frame.image is not None]
     assert stamps == [7_000_000, 57_000_000, 107_000_000]
+
+
+def test_a_table_with_quotes(tmp_path: Path) -> None:
+    """Commas and quotes in names, a byte order mark, and lines that end as on Windows."""
+    images = tmp_path / "images"
+    images.mkdir()
+    names = ["left, 1.png", 'the "2".png', "3.png"]
+    for name in names:
+        (images / name).write_bytes(b"")
+    table = tmp_path / "images.csv"
+    lines = [
+        '"name","stamp_ns"',
+        '"left, 1.png","1000000000"',
+        '"the ""2"".png", 2000000000',
+        "",
+        "3.png ,3000000000",
+    ]
+    table.write_bytes("\ufeff".encode() + "\r\n".join(lines).encode())
+    found = stamped_files(images, (".png",))
+    assert [path.name for path in found.paths] == names
+    assert found.stamps_ns.tolist() == [1_000_000_000, 2_000_000_000, 3_000_000_000]
+    table.write_text('"3.png,1000000000\n')
+    with pytest.raises(DataError, match=r"images.csv:1: found .*, expected name,stamp_ns"):
+        stamped_files(images, (".png",))
+    table.write_text(f"3.png,{2**63 - 1}\n")
+    with pytest.raises(DataError, match=f"expected nanoseconds, at most {2**62}"):
+        stamped_files(images, (".png",))
 
 
 def test_names_that_count_are_no_stamps(folder: Path) -> None:

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 
 from sst_graph.data.decoder_output import decoder_output
 from sst_graph.data.images import picture_size, read_instances, read_mask, read_picture
@@ -176,3 +177,46 @@ def test_a_process_without_stderr_reads_pictures_too(tmp_path: Path) -> None:
         f"import os; os.close(2)\nfrom sst_graph.data.images import read_picture\nread_picture({str(path)!r})"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_palette_of_colours_is_named(tmp_path: Path) -> None:
+    """As segmentation tools write masks for the eye; a palette of grey values is read as these."""
+    mask = Image.fromarray(np.array([[0, 1], [2, 1]], np.uint8), "P")
+    mask.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0])
+    mask.save(tmp_path / "mask.png")
+    with pytest.raises(DataError, match=r"mask\.png: found a palette of colours, expected one channel"):
+        read_mask(tmp_path / "mask.png")
+    mask.putpalette([7, 7, 7, 8, 8, 8, 9, 9, 9])
+    mask.save(tmp_path / "grey.png")
+    np.testing.assert_array_equal(read_mask(tmp_path / "grey.png"), [[7, 8], [9, 8]])
+
+
+FORKS = """
+import os, sys, threading
+from pathlib import Path
+from sst_graph.data.images import read_mask
+
+mask, done = Path(sys.argv[1]), threading.Event()
+
+def decode():
+    while not done.is_set():
+        read_mask(mask)
+
+thread = threading.Thread(target=decode)
+thread.start()
+stderr = os.fstat(2).st_ino
+for _ in range(5):
+    child = os.fork()
+    if child == 0:
+        read_mask(mask)
+        os._exit(os.fstat(2).st_ino != stderr)
+    assert os.waitpid(child, 0)[1] == 0
+done.set()
+thread.join()
+"""
+
+
+def test_a_fork_while_another_thread_decodes(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "mask.png"), np.zeros((64, 64), np.uint8))
+    command = [sys.executable, "-c", FORKS, str(tmp_path / "mask.png")]
+    subprocess.run(command, check=True, timeout=30)

@@ -44,11 +44,8 @@ def _reasons(result: CalibrationResult | RigResult) -> list[str]:
 def _text(args: argparse.Namespace) -> str:
     """The result in its new format."""
     result = _result(args.result)
-    if result.status != "ok":
-        if not args.force:
-            raise ConfigError(f"{args.result}: found status {result.status}, expected ok (or --force)")
-        reasons = " ".join("; ".join(_reasons(result)).split())
-        complain(f"warning: {result.status}, exported all the same" + (f": {reasons}" if reasons else ""))
+    if result.status != "ok" and not args.force:
+        raise ConfigError(f"{args.result}: found status {result.status}, expected ok (or --force)")
     options = ExportOptions(
         args.camera_frame,
         args.camera_link,
@@ -59,6 +56,9 @@ def _text(args: argparse.Namespace) -> str:
         None if args.calib is None else read_calibration(args.calib),
     )
     text = export_text(result, args.to, options)
+    if result.status != "ok":
+        reasons = " ".join("; ".join(_reasons(result)).split())
+        complain(f"warning: {result.status}, exported all the same" + (f": {reasons}" if reasons else ""))
     if args.to == "kitti" and isinstance(result, CalibrationResult) and not loudness.quiet:
         offset = heading(result, result.camera_name)[0]
         complain(f"note: calib.txt has no place for the time offset: {offset}")

@@ -27,7 +27,7 @@ from sst_graph.data.rectified import RectifiedSource
 from sst_graph.data.scan_order import rings_from_order
 from sst_graph.data.source import TURNS, Loader, SourceOptions
 from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
-from sst_graph.errors import ConfigError, DataError, printable
+from sst_graph.errors import ConfigError, DataError, count_of, printable
 from sst_graph.sweep_timing import SweepTiming
 from sst_graph.types import CameraImage, Scan, Source, with_intensities
 
@@ -117,7 +117,8 @@ def open_folder(path: Path, options: SourceOptions) -> Source:
     clouds = stamped_files(path / _CLOUDS, SUFFIXES)
     for what, files in ((_IMAGES, images), (_CLOUDS, clouds)):
         if files.without_stamp:
-            _LOG.warning("%s: %d %s without a stamp left out", printable(path), files.without_stamp, what)
+            found = count_of(files.without_stamp, what.removesuffix("s"))
+            _LOG.warning("%s: %s without a stamp left out", printable(path), found)
     model = read_camera(own / _CAMERA)
     extrinsic = own / _EXTRINSIC
     nominal = read_extrinsic(extrinsic) if os.path.lexists(extrinsic) else None

@@ -1,12 +1,13 @@
 """Stamps of files: in a CSV file beside them, or as their names.
 
-``images.csv`` beside ``images/``: one "name,stamp_ns" a line, a first line of words is a heading; a file
-without a line is left out. As a name: seconds with a decimal point ("1317048145.963.png"), or whole
-nanoseconds ("1317048145963000000.png").
+``images.csv`` beside ``images/``: one "name,stamp_ns" a line, quotes or none; a first line of words is a
+heading; a file without a line is left out. As a name: seconds with a decimal point ("1317048145.963.png"), or
+whole nanoseconds ("1317048145963000000.png").
 """
 
 from __future__ import annotations
 
+import csv
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -94,7 +95,7 @@ def _table(table: Path, files: Mapping[str, Path]) -> dict[str, int]:
         raise DataError(table, count_of(text.count(chr(10)), "line"), f"at most {MAX_STAMPS} stamps")
     stamps: dict[str, int] = {}
     for number, line in enumerate(text.splitlines(), 1):
-        words = [word.strip().strip('"') for word in line.split(",")]
+        words = _words(line)
         if not any(words) or (number == 1 and len(words) == 2 and words[1][:1].isalpha()):
             continue
         if len(words) != 2 or not _WHOLE.fullmatch(words[1]):
@@ -110,7 +111,15 @@ def _table(table: Path, files: Mapping[str, Path]) -> dict[str, int]:
     return stamps
 
 
+def _words(line: str) -> list[str]:
+    """The fields of a line, quotes removed; a name in quotes may hold commas, and quotes doubled."""
+    try:
+        return [word.strip() for word in next(csv.reader([line], skipinitialspace=True, strict=True), [])]
+    except csv.Error:
+        return [line]
+
+
 def _checked(stamp_ns: int, place: str | Path) -> int:
     if abs(stamp_ns) > LATEST_NS:
-        raise DataError(place, f"a stamp of {stamp_ns} ns", "nanoseconds that fit into 64 bits")
+        raise DataError(place, f"a stamp of {stamp_ns} ns", f"nanoseconds, at most {LATEST_NS} (146 years)")
     return stamp_ns
