@@ -107,7 +107,7 @@ class Alignment:
         """
         each = self.c_acceleration
         try:
-            return self._some(index, each if each.ndim == 1 else each[index])
+            return self._some(index, each if each.ndim == 1 else _taken(each, index))
         except IndexError:
             expected = f"positions of some of {count_of(len(self), 'match', 'matches')}"
             raise FactorError("index of take", described(index), expected) from None
@@ -125,14 +125,14 @@ class Alignment:
     def _some(self, index: slice | NDArray[np.intp], c_acceleration: FloatArray) -> Alignment:
         return replace(
             self,
-            lPs=self.lPs[index],
+            lPs=_taken(self.lPs, index),
             base_taus_s=self.base_taus_s[index],
-            pixels=self.pixels[index],
+            pixels=_taken(self.pixels, index),
             sigmas_px=self.sigmas_px[index],
-            normals=None if self.normals is None else self.normals[index],
+            normals=None if self.normals is None else _taken(self.normals, index),
             weights=self.weights[index],
             c_acceleration=c_acceleration,
-            l_velocities=None if self.l_velocities is None else self.l_velocities[index],
+            l_velocities=None if self.l_velocities is None else _taken(self.l_velocities, index),
             stretches=None if self.stretches is None else self.stretches[index],
         )
 
@@ -181,6 +181,13 @@ class Alignment:
         if self.common_tau_s is not None:
             return time_offset_s + self.common_tau_s
         return np.asarray(time_offset_s + self.base_taus_s)
+
+
+def _taken(rows: FloatArray, index: slice | NDArray[np.intp]) -> FloatArray:
+    """Some rows of (n, k): integers take them many times faster than an index does."""
+    if isinstance(index, np.ndarray) and index.dtype.kind == "i":
+        return rows.take(index, axis=0)
+    return rows[index]
 
 
 def joined_points(alignments: Sequence[Alignment]) -> Sequence[Alignment]:

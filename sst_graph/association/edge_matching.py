@@ -164,7 +164,7 @@ class PairedEdges:
             self.motions,
             self.base_taus_s[index],
             self.biases_px,
-            None if self.velocities is None else self.velocities[index],
+            None if self.velocities is None else self.velocities.take(index, axis=0),
         )
 
     def repeated(self, of_groups: ArrayLike) -> NDArray[Any]:
@@ -354,13 +354,13 @@ def match_edges(
         shift = _pixel_shift(deviation, paired, ideal)
         uvs = ideal + shift
     index = np.flatnonzero(paired.camera.in_image(uvs))
-    some, uvs = paired.take(index), uvs[index]
+    some, uvs = paired.take(index), uvs.take(index, axis=0)
     seen, objects_seen = np.diff(some.bounds), np.bincount(some.owners)
     tips: FloatArray | None = None
     # 2. Find the nearest contours within the gate.
     if any(isinstance(contour, PictureGradients) for contour in paired.contours):
         tips = some.projected(some.points.outward, cTl, time_offset_s, poses)
-        ways = tips - (uvs if shift is None else ideal[index])
+        ways = tips - (uvs if shift is None else ideal.take(index, axis=0))
         feet, shares = _contours_or_gradients(some, uvs, ways, kernel, config.edge_place)
     else:
         maps = [contour for contour in paired.contours if isinstance(contour, ContourMap)]
@@ -369,12 +369,15 @@ def match_edges(
     distances = feet.distances if enlarged is None else feet.distances / enlarged
     residuals = distances + some.repeated(some.biases_px)
     near = np.flatnonzero(feet.valid & (np.abs(residuals) < GATE * kernel.scale))
-    index, uvs, normals, pixels = index[near], uvs[near], feet.normals[near], feet.feet[near]
-    some = paired.take(index)
+    index, some = index[near], some.take(near)
+    uvs, normals, pixels = (rows.take(near, axis=0) for rows in (uvs, feet.normals, feet.feet))
     # 3. Keep contours that face the outward direction of the object.
-    tips = some.projected(some.points.outward, cTl, time_offset_s, poses) if tips is None else tips[near]
+    if tips is None:
+        tips = some.projected(some.points.outward, cTl, time_offset_s, poses)
+    else:
+        tips = tips.take(near, axis=0)
     if shift is not None and deviation is not None:
-        shift = shift[index]
+        shift = shift.take(index, axis=0)
         tips = tips + _pixel_shift(deviation.take(index), some, tips)
         pixels = pixels - shift
     outward = tips - uvs
@@ -395,15 +398,15 @@ def match_edges(
     bounds = np.searchsorted(index, paired.bounds)
     alignment = Alignment(
         camera=paired.camera,
-        lPs=paired.points.lPs[index],
+        lPs=paired.points.lPs.take(index, axis=0),
         base_taus_s=paired.base_taus_s[index],
-        pixels=pixels[on],
+        pixels=pixels.take(on, axis=0),
         sigmas_px=sigmas,
-        normals=normals[on],
+        normals=normals.take(on, axis=0),
         kernel=kernel,
         c_acceleration=paired.accelerations(np.diff(bounds)),
         weights=weights,
-        l_velocities=None if paired.velocities is None else paired.velocities[index],
+        l_velocities=None if paired.velocities is None else paired.velocities.take(index, axis=0),
         stretches=enlarged,
     )
     return EdgeMatches(index, sides, alignment, bounds, seen, shares)

@@ -94,9 +94,10 @@ class Boundaries:
 
     def take(self, index: IntArray) -> Boundaries:
         """Some of the points, by position."""
+        # Rows are taken much faster by ``take`` than by an index.
         return Boundaries(
-            self.lPs[index],
-            self.outward[index],
+            self.lPs.take(index, axis=0),
+            self.outward.take(index, axis=0),
             self.half_gaps_m[index],
             self.offsets_s[index],
             self.edges[index],

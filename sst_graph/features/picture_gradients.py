@@ -161,7 +161,7 @@ def profiles(
     distances, (u, v) = ts.astype(np.float32)[:, None], uvs.T.astype(np.float32)
     across, down = outward.T.astype(np.float32)
     u, v = u + distances * across, v + distances * down
-    np.clip(u, np.float32(0.0), (width - 1).astype(np.float32), out=u)
+    # To the sides the picture's border goes on; above and below lie other directions.
     np.clip(v, np.float32(0.0), (height - 1).astype(np.float32), out=v)
     v += (number * height).astype(np.float32)
     column, row = (uvs / 4.0).astype(np.intp).T

@@ -244,7 +244,7 @@ class FrozenProblem:
         # 2. Images and matches.
         self._images = _images(matches, state, self._columns)
         places = {key: number for number, key in enumerate(self._images.keys)}
-        self._frames = [self._frames_of(own, places) for own in matches]
+        self._frames = [frames for own in matches for frames in self._frames_of(own, places)]
         scalars = [float(values.atVector(key)[0]) for key in self._keys]
         self.start = FrozenPoint(state.cTl, np.array(scalars), self._images.twists)
 
@@ -403,27 +403,33 @@ class FrozenProblem:
         steps = point.scalars[np.array(self._terms) - 6] - frames.terms_at
         return evaluated.with_terms(frames.terms, steps, True)
 
-    def _frames_of(self, matches: DriveMatches, places: dict[int, int]) -> _Frames:
-        number = matches.number
+    def _frames_of(self, matches: DriveMatches, places: dict[int, int]) -> list[_Frames]:
+        """Of the static points of a drive, and of those on objects that move: these alone do not move as one
+        rigid body with their image's."""
+        number, alignment = matches.number, matches.alignment
         pairs = [twist_key(number, pair.image) for pair in matches.pairs]
         images = np.array([places.get(key, -1) for key in pairs])[matches.pair_of]
         biases = _bias_columns(matches, self._columns)
         order = np.lexsort((biases, images))
-        images, biases = images[order], biases[order]
         terms = (
             np.stack([matches.terms[name] for name in self._names])
             if self._names
             else np.zeros((0, len(order)))
         )
-        return _Frames(
-            matches.alignment.take(order),
-            images,
-            biases,
-            self._columns[time_offset_key(self.state.clock(number))],
-            self._terms,
-            terms[:, order],
-            np.array([self.state.nuisances.get(name, 0.0) for name in self._names]),
-        )
+        clock = self._columns[time_offset_key(self.state.clock(number))]
+        terms_at = np.array([self.state.nuisances.get(name, 0.0) for name in self._names])
+
+        def frames_of(alignment: Alignment, some: IntArray) -> _Frames:
+            return _Frames(
+                alignment.take(some), images[some], biases[some], clock, self._terms, terms[:, some], terms_at
+            )
+
+        if alignment.l_velocities is None:
+            return [frames_of(alignment, order)]
+        moving = np.atleast_1d(alignment.l_velocities.any(axis=1))[order]
+        static = replace(alignment, l_velocities=None)
+        parts = (static, order[~moving]), (alignment, order[moving])
+        return [frames_of(own, some) for own, some in parts if len(some)]
 
 
 def _ordered(keys: Sequence[int]) -> gtsam.Ordering:
