@@ -81,7 +81,7 @@ class PictureEdges:
         labels = cv2.distanceTransformWithLabels(away, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[1]
         cells = labels[half_v, half_u]
         means = np.bincount(cells, self.shifts) / np.maximum(np.bincount(cells), 1)
-        smooth = cv2.GaussianBlur(means.astype(np.float32).take(labels), (0, 0), 0.5 * _SMOOTHING_PX)
+        smooth = cv2.GaussianBlur(means.astype(np.float32)[labels], (0, 0), 0.5 * _SMOOTHING_PX)
         shifts = cv2.resize(smooth, (2 * width, 2 * height))[: inside.shape[0], : inside.shape[1]]
         unseen = np.zeros(inside.shape, np.uint8)
         unseen[v[~self.seen], u[~self.seen]] = 1
