@@ -70,9 +70,9 @@ def arrange_beams(points: FloatArray, rings: NDArray[np.integer] | None) -> Beam
     """
     rho = np.sqrt(points[:, 0] ** 2 + points[:, 1] ** 2)
     azimuth = np.arctan2(points[:, 1], points[:, 0])
-    elevation = np.arctan2(points[:, 2], np.maximum(rho, 1e-6))
-    labels = recover_rings(elevation, rho) if rings is None else rings
-    ring, counts, median_elevation = _rank_by_elevation(labels, elevation)
+    slope = points[:, 2] / np.maximum(rho, 1e-6)
+    labels = recover_rings(np.arctan(slope), rho) if rings is None else rings
+    ring, counts, median_slope = _rank_by_slope(labels, slope)
     keys = Beams.key(ring, azimuth)
     order = np.argsort(keys, kind="stable")  # points come nearly in order
     in_order = keys[order]
@@ -81,7 +81,7 @@ def arrange_beams(points: FloatArray, rings: NDArray[np.integer] | None) -> Beam
     step = float(np.median(steps[:: 1 + len(steps) // _STEPS])) if len(steps) else 0.0
     some = order[_evenly_from_each(counts)]
     height = _cone_heights(points[some, 2], rho[some], counts)
-    return Beams(order, in_order, ring, azimuth, rho, height, step, median_elevation)
+    return Beams(order, in_order, ring, azimuth, rho, height, step, np.arctan(median_slope))
 
 
 def recover_rings(elevation: FloatArray, rho: FloatArray) -> IntArray:
@@ -109,10 +109,8 @@ def recover_rings(elevation: FloatArray, rho: FloatArray) -> IntArray:
     return np.asarray(np.searchsorted(borders, elevation).astype(np.intp))
 
 
-def _rank_by_elevation(
-    labels: NDArray[np.integer], elevation: FloatArray
-) -> tuple[IntArray, IntArray, FloatArray]:
-    """Ring numbers (n,) that rise with elevation; points (rings,) of each ring, and its median elevation."""
+def _rank_by_slope(labels: NDArray[np.integer], slope: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
+    """Ring numbers (n,) that rise with elevation; points (rings,) of each ring, and its median slope."""
     lowest = int(labels.min()) if len(labels) else 0
     shifted = labels.astype(np.intp) - lowest
     used = np.bincount(shifted) > 0
@@ -121,7 +119,7 @@ def _rank_by_elevation(
     # Small integers are sorted by their digits, which costs next to nothing.
     together = np.argsort(ring.astype(np.uint16) if len(counts) < 2**16 else ring, kind="stable")
     # Of all points: medians of a part of them would swap rings that are close to one another.
-    by_ring, starts = elevation[together], np.cumsum(counts) - counts
+    by_ring, starts = slope[together], np.cumsum(counts) - counts
     for start, count in zip(starts.tolist(), counts.tolist(), strict=True):
         by_ring[start : start + count].partition(count // 2)
     medians = by_ring[starts + counts // 2]

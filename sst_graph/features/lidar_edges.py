@@ -189,7 +189,8 @@ def _side_edges(points: FloatArray, seen: _Seen, beams: Beams, side: int) -> _Ed
     far return of neighbouring firings under azimuths that differ by more, or less, than the step.
     """
     mask = seen.mask
-    member, inner = mask[beams.order], seen.inner[beams.order]
+    member = mask[beams.order]
+    inner = member if seen.inner is mask else seen.inner[beams.order]
     here, there = (member[:-1], inner[1:]) if side > 0 else (member[1:], inner[:-1])
     # Few points are the last of a class: all that follows is computed for these alone.
     place = np.flatnonzero(here & ~there) + (side < 0)
