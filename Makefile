@@ -9,6 +9,8 @@ WORKERS ?= 2
 
 # Many small matrices: threads inside NumPy and OpenCV only get in each other's way.
 export OMP_NUM_THREADS ?= 1
+# Without bytecode on disk each worker rewrites all tests, and each command that a test starts compiles the package.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: setup test test-slow lint demo bench guard mutate release-check image docs browser lock clean
 

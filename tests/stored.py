@@ -8,12 +8,11 @@ import os
 import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import partial
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate, write_drive
-from sst_graph.types import CameraImage, Frame, Scan
 
 FOLDER = "SST_GRAPH_TEST_FOLDER"
 """Environment variable: folder of the session, made by conftest.py before the workers start."""
@@ -48,31 +47,26 @@ def _name(key: object) -> str:
 
 @dataclass(frozen=True)
 class StoredDrive(SimulatedDrive):
-    """A simulated drive whose frames are :func:`stored`."""
+    """A simulated drive whose scans and images are :func:`stored`, however they are asked for."""
 
-    def read_scan(self, position: int) -> Scan:
-        scan = self[position].scan
-        assert scan is not None
-        return scan
+    def _scan(self, index: int) -> Any:
+        make = partial(super()._scan, index)
+        return stored((self.config, "scan", index), make) if self is _DRIVES.get(self.config) else make()
 
-    def read_image(self, position: int) -> CameraImage:
-        if simulated(self.config) is not self:
-            return super().read_image(position)
-        image = self[position].image
-        assert image is not None
-        return image
-
-    def __getitem__(self, position: int) -> Frame:
-        if simulated(self.config) is not self:  # changed since: a drive of its own
-            return super().__getitem__(position)
-        index = self._checked(position)
-        return stored((self.config, index), lambda: super(StoredDrive, self).__getitem__(index))
+    def _image(self, index: int) -> Any:
+        make = partial(super()._image, index)
+        return stored((self.config, "image", index), make) if self is _DRIVES.get(self.config) else make()
 
 
-@cache
+_DRIVES: dict[SimulationConfig, StoredDrive] = {}
+"""Of this process; one that was changed since is a drive of its own, and is not stored."""
+
+
 def simulated(config: SimulationConfig) -> StoredDrive:
-    """As :func:`sst_graph.simulator.simulate`, but each frame is rendered once a session."""
-    return StoredDrive(**vars(simulate(config)))
+    """As :func:`sst_graph.simulator.simulate`, but each scan and image is rendered once a session."""
+    if config not in _DRIVES:
+        _DRIVES[config] = StoredDrive(**vars(simulate(config)))
+    return _DRIVES[config]
 
 
 def written(config: SimulationConfig) -> Path:
@@ -81,5 +75,5 @@ def written(config: SimulationConfig) -> Path:
     with open(folder.parent.with_suffix(".lock"), "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not folder.exists():
-            write_drive(simulate(config), folder)
+            write_drive(simulated(config), folder)
     return folder

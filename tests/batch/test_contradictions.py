@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 import pytest
 from stored import simulated
+from streets import TRACKED_STREET
 
 from sst_graph import CalibrationConfig, open_source
 from sst_graph.batch.calibrate import calibrate_prepared, prepare_drives
@@ -114,9 +115,16 @@ def calibrated(sources: Sequence[Source], config: CalibrationConfig = CONFIG) ->
     )
 
 
-def parts_of(drives: Sequence[Drive], time_offset_s: float) -> PartSolver:
+@cache
+def prepared() -> list[Drive]:
+    """Twelve frames of a clean drive."""
+    clean = simulated(TRACKED_STREET)
+    return prepare_drives([Edited(clean, [clean[k] for k in range(12)])], CONFIG)
+
+
+def parts_of(drives: Sequence[Drive]) -> PartSolver:
     """Ready to be solved, about the truth."""
-    truth = street().truth.cTl
+    truth, time_offset_s = simulated(TRACKED_STREET).truth.cTl, TRACKED_STREET.time_offset_s
     problem = CalibrationProblem.of(drives, Guess(truth, time_offset_s), CONFIG)
     return PartSolver(problem, State(truth, (time_offset_s,)))
 
@@ -219,8 +227,8 @@ def test_the_offset_of_every_drive_counts() -> None:
 
 
 def test_parts_have_the_tracks_of_their_scans() -> None:
-    drives = prepare_drives([Edited(street(), frames_of())], CONFIG)
-    parts, scans = parts_of(drives, STREET.time_offset_s), (3, 4, 5, 6, 10, 11)
+    drives = prepared()
+    parts, scans = parts_of(drives), (3, 4, 5, 6, 10, 11)
     tracks = parts.problem.tracks.part(0, scans)
     assert tracks.objects is not None
     own = tracks.objects[0]
@@ -235,16 +243,16 @@ def test_parts_have_the_tracks_of_their_scans() -> None:
 
 
 def test_a_part_without_common_labels_has_no_estimate() -> None:
-    drives = prepare_drives([Edited(street(), frames_of())], CONFIG)
+    drives = prepared()
     blank = replace(drives[0], images=tuple(replace(image, contours={}) for image in drives[0].images))
-    parts = parts_of([blank], STREET.time_offset_s)
+    parts = parts_of([blank])
     assert parts.solve(Part(0, (0, 1, 2, 3))) is None
     assert find_contradictions(parts).sentences == ()
 
 
 def test_motion_that_contradicts_a_stretch_is_left_out() -> None:
-    drives = prepare_drives([Edited(street(), frames_of())], CONFIG)
-    parts = parts_of(drives, STREET.time_offset_s)
+    drives = prepared()
+    parts = parts_of(drives)
     objects = parts.problem.objects
     joint = replace(parts.problem.joint(), config=JointConfig())
     solution = solve_joint(joint, parts.reference, (5.0, 3.0))

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from stored import written
-from streets import standing_street
+from streets import SHORT_STREET, standing_street
 
 from sst_graph import open_source
 from sst_graph.batch import CalibrationConfig, prepare_drives
@@ -23,7 +23,6 @@ from sst_graph.cli.outputs import write_calibration
 from sst_graph.drive.preparation import Drive, prepare_drive
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.result import CalibrationResult, FrameId
-from sst_graph.simulator import SimulationConfig
 from sst_graph.types import Frame, SemanticClass
 
 VEHICLE = SemanticClass.VEHICLE
@@ -120,11 +119,8 @@ def opened_files() -> Iterator[Counter[str]]:
 
 @pytest.fixture(scope="module")
 def street() -> Path:
-    """Ten frames on disk, of a street driven along, without times of the points."""
-    config = SimulationConfig(
-        seed=5, frames=10, width=414, height=125, azimuth_step_deg=0.6, motion="no_stop", speed_mps=8.0
-    )
-    return written(config)
+    """A street driven along, on disk, without times of the points."""
+    return written(SHORT_STREET)
 
 
 def of_folders(opened: Counter[str], *folders: str) -> dict[str, int]:
@@ -137,7 +133,7 @@ def test_each_file_is_read_once(street: Path) -> None:
 
     Method auto looks at some frames first, for labels.
     """
-    source = open_source(street)
+    source = open_source(street, frames="0:10")
     with opened_files() as opened:
         (drive,) = prepare_drives([source], CalibrationConfig(method="joint"))
     assert drive.sweep is not None and drive.sweep.kind != "given"
@@ -147,7 +143,7 @@ def test_each_file_is_read_once(street: Path) -> None:
 
 def test_pictures_read_what_they_show(street: Path, tmp_path: Path) -> None:
     """Four scans are candidates for each of three pictures, and two beside each tell its motion."""
-    source = open_source(street)
+    source = open_source(street, frames="0:10")
     result = CalibrationResult(
         T_camera_lidar=source.nominal,
         time_offset_s=0.0,

@@ -17,11 +17,12 @@ from sst_graph.data import SourceOptions, open_source
 from sst_graph.data.frame_parts import RecentReader
 from sst_graph.data.two_clocks import DriveProperties, Sensor, TwoClockSource, merged
 from sst_graph.errors import ConfigError, DataError
+from sst_graph.factors import PinholeCamera
 from sst_graph.result import CalibrationResult
 from sst_graph.simulator import SimulatedDrive
 from sst_graph.types import NO_PICTURE, CameraImage, Frame, Scan
 
-PROPERTIES = DriveProperties("two", simulated(CROWDED_STREET).camera)
+PROPERTIES = DriveProperties("two", PinholeCamera(700.0, 700.0, 4.0, 3.0, 8, 6))
 
 
 def scans_of(stamps: list[int]) -> Sensor[Scan]:

@@ -34,6 +34,8 @@ def test_no_mutated_input_brings_anything_down(inputs: Path) -> None:
 
 
 def _case_of(inputs: Path, bad: str) -> fuzz.Case:
+    """The verdict on a piece of code, which reads none of the inputs."""
+
     def attempt(ground: fuzz.Ground, rng: np.random.Generator) -> None:
         exec(bad, {"np": np})
 
@@ -54,13 +56,13 @@ def _case_of(inputs: Path, bad: str) -> fuzz.Case:
         (f"{IMPORTED}\ne = SstGraphError()\ne.args = ('a\\x1b',)\nraise e", "no printable line"),
     ],
 )
-def test_the_fuzzer_sees_what_is_wrong(inputs: Path, bad: str, why: str) -> None:
-    case = _case_of(inputs, bad)
+def test_the_fuzzer_sees_what_is_wrong(tmp_path: Path, bad: str, why: str) -> None:
+    case = _case_of(tmp_path, bad)
     assert case.verdict == "FAILURE" and why in case.why, case
 
 
-def test_an_error_of_the_package_is_no_failure(inputs: Path) -> None:
-    case = _case_of(inputs, f"{IMPORTED}\nraise SstGraphError('a')")
+def test_an_error_of_the_package_is_no_failure(tmp_path: Path) -> None:
+    case = _case_of(tmp_path, f"{IMPORTED}\nraise SstGraphError('a')")
     assert (case.verdict, case.why) == ("error", "a")
 
 

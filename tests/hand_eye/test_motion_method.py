@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from moving_drives import OFFSET_S, TRUE, made_drive, resting, straight, weaving
 from stored import written
+from streets import standing_street
 
 from sst_graph.batch import CalibrationConfig, calibrate, calibrate_prepared
 from sst_graph.batch.motion_factor import gaussian_factor
@@ -220,7 +221,7 @@ def test_the_joint_method_hears_the_motion(street: Path) -> None:
     assert abs(hearing.time_offset_s - truth.time_offset_s) < 4.0 * np.sqrt(hearing.covariance[6, 6])
 
 
-def test_one_clock_only(street: Path) -> None:
+def test_one_clock_only() -> None:
     settings = dataclasses.replace(CalibrationConfig(), use_motion="always", time_offset_per_drive=True)
     with pytest.raises(ConfigError, match="use_motion"):
-        calibrate(open_source(street), None, settings)
+        calibrate(standing_street(), None, settings)

@@ -287,7 +287,7 @@ def test_a_first_motion_along_a_street_is_not_taken_for_rest(seed: int, speed_mp
         seed=seed, frames=2, width=310, height=94, motion="constant", speed_mps=speed_mps
     )
     drive, odometry = simulate(config), LidarOdometry()
-    scans = [frame.scan for frame in drive if frame.scan is not None]
+    scans = [drive.scan(k) for k in range(2)]
     motion = [odometry.add(scan) for scan in scans][1]
     true = drive.wTl(1e-9 * scans[0].stamp_ns).between(drive.wTl(1e-9 * scans[1].stamp_ns))
     assert motion is not None and motion.ok

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from stored import simulated
 
 from sst_graph import open_source
 from sst_graph.cli import main
@@ -24,7 +26,7 @@ from sst_graph.odometry.sweep import (
 )
 from sst_graph.odometry.sweep.estimate import CANDIDATES, Evidence, estimate
 from sst_graph.odometry.sweep.window import SECTORS, Window
-from sst_graph.simulator import SimulationConfig, simulate, write_drive
+from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate, write_drive
 from sst_graph.sweep_timing import SweepTiming
 from sst_graph.types import Frame, Scan
 
@@ -82,22 +84,27 @@ def test_a_timing_survives_its_dictionary_and_refuses_nonsense() -> None:
     assert not np.isnan(timing.offsets_s(np.full((2, 3), np.nan, np.float32))).any()
 
 
+@cache
+def standing() -> SimulatedDrive:
+    return simulate(
+        SimulationConfig(
+            seed=4,
+            frames=2,
+            motion="standing",
+            rolling=True,
+            azimuth_step_deg=2.0,
+            frame_rate_hz=5.0,
+            sweep_start_deg=130.0,
+        )
+    )
+
+
 @pytest.mark.parametrize("sense", ["clockwise", "counterclockwise"])
 @pytest.mark.parametrize("stamp", ["forward", "start", "end"])
 def test_the_simulator_fires_when_the_model_says(sense: Any, stamp: Any) -> None:
     """Two implementations of one page of geometry: the simulator's is not the estimator's."""
-    config = SimulationConfig(
-        seed=4,
-        frames=2,
-        motion="standing",
-        rolling=True,
-        azimuth_step_deg=2.0,
-        frame_rate_hz=5.0,
-        sweep_sense=sense,
-        sweep_start_deg=130.0,
-        sweep_stamp=stamp,
-    )
-    scan = simulate(config).scan(0)
+    config = replace(standing().config, sweep_sense=sense, sweep_stamp=stamp)
+    scan = replace(standing(), config=config).scan(0)
     timing = SweepTiming(1.0 if sense == "counterclockwise" else -1.0, np.radians(130.0), 0.2, stamp)
     assert scan.offsets_s is not None
     # A point on the very border may fall to either side of it.
@@ -107,7 +114,7 @@ def test_the_simulator_fires_when_the_model_says(sense: Any, stamp: Any) -> None
 
 def test_a_compensated_sweep_is_the_raw_one_moved_by_the_true_motion() -> None:
     raw = simulate(replace(STREET, frames=2, azimuth_step_deg=2.0))
-    moved = simulate(replace(STREET, frames=2, azimuth_step_deg=2.0, sweep_output="compensated"))
+    moved = replace(raw, config=replace(raw.config, sweep_output="compensated"))
     scan, compensated = raw.scan(1), moved.scan(1)
     assert scan.offsets_s is not None and compensated.offsets_s is None
     stamp_s = scan.stamp_ns * 1e-9
@@ -319,7 +326,7 @@ def test_a_source_is_read_once_and_its_own_times_are_kept() -> None:
 
 def test_the_sweep_of_a_result_is_used_again() -> None:
     decision = SweepDecision("clockwise", SweepTiming(-1.0, np.pi, 0.1), -0.97, 0.05)
-    drive = simulate(replace(STREET, frames=3, sweep_output="raw"))
+    drive = simulated(replace(STREET, frames=3, sweep_output="raw"))
     again = with_sweep_of(drive, {SWEEP_KEY: {drive.name: decision.to_dict()}})
     assert isinstance(again, SweptSource) and again.sweep_decision.timing.fraction == -1.0
     assert again[0].scan is not None and again[0].scan.offsets_s is not None

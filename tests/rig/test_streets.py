@@ -9,7 +9,8 @@ from functools import cache
 import gtsam
 import numpy as np
 import pytest
-from stored import stored
+from stored import simulated, stored
+from streets import CROWDED_STREET as STREET
 
 from sst_graph import CalibrationConfig, calibrate
 from sst_graph.config import with_overrides
@@ -20,27 +21,17 @@ from sst_graph.odometry.sweep.decision import SweepDecision
 from sst_graph.rig import KnownPose, KnownRig, RigMarginal, RigResult, calibrate_rig
 from sst_graph.rig.adjustment import adjusted
 from sst_graph.rig.calibrate import calibrate_rig_prepared, prepare_rig
-from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
+from sst_graph.simulator import SimulatedDrive, simulate
 from sst_graph.simulator.rig import beside, stereo_pose, with_mounts
 from sst_graph.types import CameraImage, Guess, Scan, SemanticClass
 
-STREET = SimulationConfig(
-    seed=5000,
-    frames=20,
-    width=621,
-    height=188,
-    azimuth_limit_deg=50.0,
-    azimuth_step_deg=0.3,
-    vehicle_density=0.3,
-    time_offset_s=0.05,
-)
 NAMES = ("left", "right")
 
 
 @cache
 def rig() -> Mapping[str, SimulatedDrive]:
     """A stereo rig with one trigger."""
-    drive = simulate(STREET)
+    drive = simulated(STREET)
     return with_mounts(drive, {"right": beside(drive, stereo_pose())}, "left")
 
 

@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 import pytest
 from stored import simulated
+from streets import LENS_STREET
 
 from sst_graph import CalibrationConfig
 from sst_graph.batch.by_edges.halves import halves_reasons
@@ -70,5 +71,7 @@ def test_a_knock_is_named_though_the_estimate_fits_one_half() -> None:
 
 
 def test_short_drives_are_not_judged() -> None:
-    problem, state = problem_of(replace(street(), frames=street().frames[:10]))
+    """Six scans a half, though a knock is between them."""
+    short = KeptDrive.of(simulated(LENS_STREET), sweep="compensated")
+    problem, state = problem_of(knocked(short, 3.0))
     assert halves_reasons(problem, state, COVARIANCE) == ()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -25,9 +26,15 @@ from sst_graph.graph.state import State
 from sst_graph.types import Guess
 
 CONFIG = CalibrationConfig(decide_sweep=False)
-TRUTH = State(simulated(STREET).truth.cTl, (simulated(STREET).truth.time_offset_s,))
 
 
+@cache
+def truth() -> State:
+    true = simulated(STREET).truth
+    return State(true.cTl, (true.time_offset_s,))
+
+
+@cache
 def drive(right_px: float = 0.0) -> Drive:
     """The street, its principal point this far from the one given."""
     kept = with_principal_point(KeptDrive.of(simulated(STREET)), right_px, 0.0)
@@ -37,8 +44,8 @@ def drive(right_px: float = 0.0) -> Drive:
 def found(own: Drive) -> dict[str, ParameterTest]:
     """What edges say, from an estimate that makes up for a principal point by a turn, as labels do."""
     turned = (own.camera.cx - simulated(STREET).camera.cx) / own.camera.fx
-    state = replace(TRUTH, cTl=TRUTH.cTl.retract(np.array([0.0, 0.0, turned, 0.0, 0.0, 0.0])))
-    problem = CalibrationProblem.of([own], Guess(TRUTH.cTl, TRUTH.time_offsets_s[0]), CONFIG)
+    state = replace(truth(), cTl=truth().cTl.retract(np.array([0.0, 0.0, turned, 0.0, 0.0, 0.0])))
+    problem = CalibrationProblem.of([own], Guess(truth().cTl, truth().time_offsets_s[0]), CONFIG)
     return {each.assumption.name: each for each in lens_beside_labels(problem, state)}
 
 
@@ -95,7 +102,9 @@ def test_two_tests_of_a_parameter_are_weighted_by_their_variances() -> None:
 def test_a_result_by_labels_is_not_ok_with_a_wrong_principal_point() -> None:
     street = KeptDrive.of(simulated(replace(STREET, seed=507, frames=24, motion="mixed")))
     config = with_overrides(CONFIG, ["find_causes=false"])
-    right, wrong = (calibrate(with_principal_point(street, px, 0.0), TRUTH.cTl, config) for px in (0.0, 6.0))
+    right, wrong = (
+        calibrate(with_principal_point(street, px, 0.0), truth().cTl, config) for px in (0.0, 6.0)
+    )
     assert right.status == "ok"
     assert wrong.status == "not_converged"
     assert wrong.reasons[0].startswith("the pictures lie beside the principal point cx: cx = ")
