@@ -15,6 +15,8 @@ FloatArray = NDArray[np.float64]
 
 _TAKES_PART = 0.1
 """Least part of a weak direction's unit vector that is named."""
+_TRADE_CORRELATION = 0.9
+"""From here on a translation would be known more than twice as well if the time offset were known."""
 _WITH_ROTATION = 0.3
 """Least part of both rotation and time offset in a direction that is said to be of the two."""
 _ALONG_AXIS = 0.95
@@ -100,7 +102,7 @@ def weak_directions(
     for value, vector in sorted(zip(values, vectors.T, strict=True), key=lambda pair: -pair[0]):
         if value <= 1.0:
             break
-        found.append(_describe(limits * vector * np.sqrt(value), cTl, advice))
+        found.append(_describe(limits * vector * np.sqrt(value), covariance, cTl, advice))
     return tuple(found)
 
 
@@ -169,22 +171,36 @@ def _paired(covariance: FloatArray) -> float:
     return float(np.sqrt(min(max(explained, 0.0), 1.0)))
 
 
-def _describe(step: FloatArray, cTl: gtsam.Pose3, advice: Advice) -> WeakDirection:
-    """A weak direction from its one-sigma step (7,) [rad, m, s]."""
+def _describe(step: FloatArray, covariance: FloatArray, cTl: gtsam.Pose3, advice: Advice) -> WeakDirection:
+    """A weak direction from its one-sigma step (7,) [rad, m, s], an axis of the covariance."""
     scaled = step / DIRECTION_SCALES
     sigma = float(np.linalg.norm(scaled))
     vector = scaled / sigma
     if vector[np.abs(vector).argmax()] < 0:
         step, vector = -step, -vector
-    c_step = np.asarray(cTl.rotation().matrix()) @ step[3:6]
-    sentence, remedy = _words(step[:3], c_step, float(step[6]), vector, advice)
+    c_step = np.concatenate([step[:3], np.asarray(cTl.rotation().matrix()) @ step[3:6], step[6:]])
+    sentence, remedy = _words(c_step, vector, _traded(covariance, step), advice)
     return WeakDirection(vector, sigma, sentence, remedy)
 
 
-def _words(
-    rotation: FloatArray, c_translation: FloatArray, time_offset_s: float, vector: FloatArray, advice: Advice
-) -> tuple[str, str]:
-    """What one sigma along a weak direction means, and what to record."""
+def _traded(covariance: FloatArray, step: FloatArray) -> bool:
+    """Whether the time offset and the translation along a step (7,) hardly separate: only then is the ratio
+    of their parts a rate at which one makes up for the other."""
+    along = np.concatenate([np.zeros(3), step[3:6], [0.0]])
+    offset = np.eye(7)[6]
+    variances = (along @ covariance @ along) * (offset @ covariance @ offset)
+    return bool(abs(along @ covariance @ offset) > _TRADE_CORRELATION * np.sqrt(max(variances, 1e-300)))
+
+
+def _words(step: FloatArray, vector: FloatArray, traded: bool, advice: Advice) -> tuple[str, str]:
+    """What one sigma along a weak direction means, and what to record.
+
+    Args:
+        step: (7,) along it, with the translation in the camera's axes.
+        vector: (7,) the direction in scaled units.
+        traded: translation and time offset hardly separate.
+    """
+    rotation, c_translation, time_offset_s = step[:3], step[3:6], float(step[6])
     parts = {
         "rotation": float(np.linalg.norm(vector[:3])),
         "translation": float(np.linalg.norm(vector[3:6])),
@@ -192,7 +208,7 @@ def _words(
     }
     translation_m = float(np.linalg.norm(c_translation))
     words = _axis_words(c_translation)
-    if parts["offset"] > _TAKES_PART and parts["translation"] > _TAKES_PART:
+    if traded and parts["offset"] > _TAKES_PART and parts["translation"] > _TAKES_PART:
         rate_ms = abs(time_offset_s) * 1e3 / translation_m if translation_m else 0.0
         sign = "later" if time_offset_s > 0 else "earlier"
         return (

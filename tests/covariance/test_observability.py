@@ -126,6 +126,14 @@ def test_a_rotation_that_goes_with_the_time_offset() -> None:
     assert alone.sentence == "the time offset is known to 200.0 ms only (one sigma)"
 
 
+def test_a_translation_that_hardly_depends_on_the_time_offset_names_no_rate() -> None:
+    loose = GOOD + np.diag([0.0] * 3 + [0.1**2, 0.0, 0.0, 0.003**2])
+    loose[3, 6] = loose[6, 3] = 0.3 * 0.1 * 0.003
+    (weak,) = weak_directions(loose, CTL, CONFIG)
+    assert abs(weak.vector[6]) > 0.05
+    assert weak.sentence.startswith("the translation is known to 10.") and "forward" in weak.sentence
+
+
 def test_the_weakest_first_and_only_past_the_limits() -> None:
     sigmas = np.array([0.001, 0.001, 0.02, 0.3, 0.01, 0.01, 0.001])
     found = weak_directions(np.diag(sigmas**2), CTL, CONFIG)
