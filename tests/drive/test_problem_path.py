@@ -23,6 +23,12 @@ def weaving(t: float) -> gtsam.Pose3:
     return gtsam.Pose3(rotation, np.array([8.0 * t, 2.0 * np.sin(0.7 * t), 0.1 * np.sin(1.1 * t)]))
 
 
+def pitching(t: float) -> gtsam.Pose3:
+    """Pose at a time [s]: 8 m/s, pitching and heaving at 1.5 Hz."""
+    wave = np.sin(2.0 * np.pi * 1.5 * t)
+    return gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.03 * wave, 0.0), np.array([8.0 * t, 0.0, 0.02 * wave]))
+
+
 def motions(pose: Callable[[float], gtsam.Pose3], stamps_ns: list[int]) -> list[RelativeMotion]:
     return [
         RelativeMotion(a, b, pose(a * 1e-9).between(pose(b * 1e-9)), COVARIANCE)
@@ -61,6 +67,23 @@ def test_between_stamps_it_follows_the_motion(jitter: int) -> None:
         twist = gtsam.Pose3.Logmap(weaving(t - h).between(weaving(t + h))) / (2.0 * h)
         np.testing.assert_allclose(step.twists_a[0, :3], twist[:3], atol=0.02)
         np.testing.assert_allclose(step.twists_a[0, 3:], twist[3:], atol=0.1)
+
+
+@pytest.mark.parametrize("jitter", [0, 9_000_000])
+@pytest.mark.parametrize(
+    ("way", "bounds"), [(weaving, (3e-5, 1e-4, 2e-3, 4e-3)), (pitching, (2e-4, 7e-4, 0.008, 0.02))]
+)
+def test_far_from_the_ends_it_follows_closely(
+    way: Callable[[float], gtsam.Pose3], bounds: tuple[float, ...], jitter: int
+) -> None:
+    path = SensorPath(motions(way, [k * PERIOD_NS + jitter * (k % 3) for k in range(40)]))
+    for t in np.arange(0.35, 3.4, 0.0371):
+        step = step_of(path, round(t * 1e9), round((t + 0.1) * 1e9))
+        assert step is not None
+        error = way(t).between(way(t + 0.1)).localCoordinates(gtsam.Pose3(step.aTbs[0]))
+        twist = gtsam.Pose3.Logmap(way(t - 1e-5).between(way(t + 1e-5))) / 2e-5 - step.twists_a[0]
+        found = [np.abs(part).max() for part in (error[:3], error[3:], twist[:3], twist[3:])]
+        assert (np.array(found) < bounds).all()
 
 
 def test_twists_are_continuous_at_stamps() -> None:
