@@ -71,5 +71,5 @@ def test_what_moves_in_an_unknown_way_is_left_out() -> None:
 
 def test_one_pose_a_scan() -> None:
     scan, wTl = box_scan(0, [np.array([20.0, 3.0])])
-    with pytest.raises(DataError, match="1 poses, expected 2, one a scan"):
+    with pytest.raises(DataError, match="1 pose, expected 2, one a scan"):
         follow_objects([scan, scan], [wTl], OBJECTS)

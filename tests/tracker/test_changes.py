@@ -172,7 +172,7 @@ def _alone(frame: Frame, street: SimulatedDrive, instance: int) -> Frame:
     (left, top), (right, bottom) = np.nanmin(uvs, axis=0) - 18.0, np.nanmax(uvs, axis=0) + 18.0
     mask = np.full_like(frame.image.mask, SemanticClass.IGNORE)
     box = (slice(max(0, int(top)), int(bottom)), slice(max(0, int(left)), int(right)))
-    mask[box] = np.roll(frame.image.mask, 9, axis=1)[box]
+    mask[box] = np.roll(frame.image.mask, 8, axis=1)[box]
     other = (frame.scan.classes == SemanticClass.VEHICLE) & (frame.scan.instances != instance)
     return dataclasses.replace(
         frame,
