@@ -26,6 +26,7 @@ from sst_graph.covariance.cluster_robust import RobustCovariance, covariance_of,
 from sst_graph.covariance.considered import AssumptionConfig, Considered
 from sst_graph.covariance.error_model import fit_error_model
 from sst_graph.covariance.match_table import MatchTable, match_table
+from sst_graph.covariance.observability import weak_directions
 from sst_graph.errors import EstimationError
 from sst_graph.graph.building import state_from
 from sst_graph.graph.elimination import Unknowns, marginal_covariance
@@ -118,15 +119,17 @@ def examine_assumptions(
     """Test the assumptions against the data, and consider in the covariance what the data leave open.
 
     Args:
-        further: tests by other data than the matches, asked where these contradict nothing. What they
-            contradict counts; what they leave open is considered as the matches have it.
+        further: tests by other data than the matches, asked where these contradict nothing and leave no
+            direction open: else the result is not ok by itself. What they contradict counts; what they leave
+            open is considered as the matches have it.
 
     Returns:
         The tests, the most contradicted first, and what the assumptions add to the covariance.
     """
     config, state = problem.config.assumptions, estimate.solution.state
     findings = check_assumptions(SolvedProblem(problem, estimate.solution), config)
-    if config.test and not any(finding.contradicted for finding in findings):
+    open_ = weak_directions(estimate.covariance[:7, :7], state.cTl, problem.config.observability)
+    if config.test and not open_ and not any(finding.contradicted for finding in findings):
         findings = with_further_tests(findings, further(problem, state), config.threshold)
     considered = estimate.considered(config)
     return findings, with_test_results(considered, findings)
