@@ -47,7 +47,7 @@ SCAN_HASHES = "scan_hashes"
 MOST_SCAN_HASHES = 32
 """Hashes that a result keeps of its scans."""
 _MOST_FUSED = 1_000_000
-_HASH = re.compile("[0-9a-f]{16}")
+_HASH, _HASHES = re.compile("[0-9a-f]{16}"), "texts of 16 hexadecimal digits"
 
 _ORDER = ["rot_x_rad", "rot_y_rad", "rot_z_rad", "trans_x_m", "trans_y_m", "trans_z_m", "time_offset_s"]
 
@@ -229,18 +229,21 @@ def hashes_in(table: JsonTable) -> tuple[str, ...]:
         DataError: something else.
     """
     found = table.sequence(SCAN_HASHES) if SCAN_HASHES in table.data else []
-    if len(found) > _MOST_FUSED or not all(isinstance(one, str) and _HASH.fullmatch(one) for one in found):
-        raise DataError(f"{table.place}: {SCAN_HASHES}", "something else", "texts of 16 hexadecimal digits")
+    if len(found) > _MOST_FUSED or not all(map(_is_hash, found)):
+        raise DataError(f"{table.place}: {SCAN_HASHES}", "something else", _HASHES)
     return tuple(found)
 
 
 def _checked_hashes(what: str, value: Any) -> tuple[str, ...]:
-    expected = "texts of 16 hexadecimal digits"
-    checked_type(what, value, (tuple, list), expected)
+    checked_type(what, value, (tuple, list), _HASHES)
     for one in value:
-        if not (isinstance(one, str) and _HASH.fullmatch(one)):
-            raise FactorError(what, described(one), expected)
+        if not _is_hash(one):
+            raise FactorError(what, described(one), _HASHES)
     return tuple(value)
+
+
+def _is_hash(value: object) -> bool:
+    return isinstance(value, str) and _HASH.fullmatch(value) is not None
 
 
 def _bounded(table: JsonTable, key: str, values: FloatArray) -> FloatArray:

@@ -128,8 +128,10 @@ def examine_assumptions(
     """
     config, state = problem.config.assumptions, estimate.solution.state
     findings = check_assumptions(SolvedProblem(problem, estimate.solution), config)
-    open_ = weak_directions(estimate.covariance[:7, :7], state.cTl, problem.config.observability)
-    if config.test and not open_ and not any(finding.contradicted for finding in findings):
+    if config.test and not (
+        any(finding.contradicted for finding in findings)
+        or weak_directions(estimate.covariance[:7, :7], state.cTl, problem.config.observability)
+    ):
         findings = with_further_tests(findings, further(problem, state), config.threshold)
     considered = estimate.considered(config)
     return findings, with_test_results(considered, findings)

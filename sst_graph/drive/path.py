@@ -70,7 +70,7 @@ class SensorPath:
             self._poses.append(self._poses[-1].compose(motion.aTb))
         broken = np.array([not motion.ok for motion in motions], np.int64)
         self._piece = np.concatenate([[0], np.cumsum(broken)])
-        self._cubics: dict[int, _Cubic] = {}
+        self._polynomials: dict[int, _Polynomial] = {}
         self._ok = np.array([motion.ok for motion in motions], np.bool_)
         self._covariances = np.array([motion.covariance for motion in motions]).reshape(-1, 6, 6)
         self._matrices = np.array([pose.matrix() for pose in self._poses])
@@ -135,13 +135,13 @@ class SensorPath:
         """
         if not len(stamps_ns):
             return np.zeros((0, 4, 4)), np.zeros((0, 6)), np.zeros((0, _NODES, 2))
-        cubics = [self._cubic(i) for i in intervals.tolist()]
+        polynomials = [self._polynomial(i) for i in intervals.tolist()]
         seconds = (stamps_ns - self._stamps[intervals]) * 1e-9
         powers = seconds[:, None] ** np.arange(_NODES)
         rates = np.arange(_NODES) * np.column_stack([np.zeros(len(seconds)), powers[:, :-1]])
         both = np.stack([powers, rates], axis=1)
-        logs, slopes = np.swapaxes(both @ np.array([cubic.coefficients for cubic in cubics]), 0, 1)
-        weights = both @ np.array([cubic.inverse for cubic in cubics])
+        logs, slopes = np.swapaxes(both @ np.array([each.coefficients for each in polynomials]), 0, 1)
+        weights = both @ np.array([each.inverse for each in polynomials])
         starts = self._matrices[intervals]
         moved = np.array([gtsam.Pose3.Expmap(log).matrix() for log in logs])
         derivatives = np.array([gtsam.Pose3.ExpmapDerivative(log) for log in logs])
@@ -155,9 +155,9 @@ class SensorPath:
             total += np.where(within, self._covariances[np.minimum(first + k, last)], 0.0)
         return np.asarray(total / (last - first + 1)[:, None, None])
 
-    def _cubic(self, i: int) -> _Cubic:
+    def _polynomial(self, i: int) -> _Polynomial:
         """The polynomial of interval i."""
-        if i not in self._cubics:
+        if i not in self._polynomials:
             around = [
                 k
                 for k in range(max(i - _REACH, 0), min(i + 2 + _REACH, len(self._poses)))
@@ -170,12 +170,12 @@ class SensorPath:
             coefficients[: len(blended)] = blended @ np.stack(logs)
             oldest = around[0] - max(i - _REACH, 0)
             inverse[: len(blended), oldest : oldest + len(around)] = blended
-            self._cubics[i] = _Cubic(inverse, coefficients)
-        return self._cubics[i]
+            self._polynomials[i] = _Polynomial(inverse, coefficients)
+        return self._polynomials[i]
 
 
 @dataclass(frozen=True)
-class _Cubic:
+class _Polynomial:
     """Polynomial of one interval.
 
     Attributes:

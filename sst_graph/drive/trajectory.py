@@ -86,18 +86,19 @@ class TwistTrack:
         (before, after), (rate_before, rate_after) = twists[place], rates[place]
         spans = self._middles[i + 1] - self._middles[i]
         fractions = np.minimum(np.maximum((t - self._middles[i]) / spans, -0.5), 1.5)
-        u = np.minimum(np.maximum(fractions, 0.0), 1.0)[:, None]
-        h = spans[:, None]
+        inside = np.minimum(np.maximum(fractions, 0.0), 1.0)
+        # The cubic of Hermite by its coefficients, and its derivative.
+        h, s = spans[:, None], (inside * spans)[:, None]
         slopes = (after - before) / h
-        # The cubic of Hermite, and its derivative.
-        value = before + u * h * (slopes + (1.0 - u) * _bend(u, slopes, rate_before, rate_after))
-        rate = (1.0 - u) * (1.0 - 3.0 * u) * rate_before + u * (3.0 * u - 2.0) * rate_after
-        rate += 6.0 * u * (1.0 - u) * slopes
+        square = (3.0 * slopes - 2.0 * rate_before - rate_after) / h
+        cube = (rate_before + rate_after - 2.0 * slopes) / h**2
+        value = before + s * (rate_before + s * (square + s * cube))
+        rate = rate_before + s * (2.0 * square + 3.0 * s * cube)
         # As if both errors were equal, as they nearly are for smoothed motions.
         weights = np.abs([1.0 - fractions, fractions])[:, :, None, None]
         covariances = np.array([_covariance(self._motions[number]) for number in used.tolist()])[place]
         total = weights[0] * covariances[0] + weights[1] * covariances[1]
-        beyond = (fractions - u[:, 0]) * spans
+        beyond = (fractions - inside) * spans
         total[:, _AXES, _AXES] += (rate * beyond[:, None]) ** 2
         return TwistSamples(value + rate * beyond[:, None], rate, total)
 
@@ -120,11 +121,6 @@ class TwistTrack:
         rates = 2.0 * before + third * (2.0 * h[:, 0] + h[:, 1])
         twists[still], rates[still] = 0.0, 0.0
         return twists, rates
-
-
-def _bend(u: FloatArray, slopes: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
-    """What a cubic between two values, of given rates there, has beyond the straight line, over u (1 - u)."""
-    return np.asarray((1.0 - u) * (before - slopes) - u * (after - slopes))
 
 
 _AXES = np.arange(6)

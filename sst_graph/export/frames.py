@@ -105,8 +105,7 @@ class Rig:
             if self.options.camera_link is not None and frames.link not in (parent, child):
                 raise ConfigError(
                     f"--camera-link {self.options.camera_link} would change nothing: expected the link "
-                    "at one "
-                    "end, by --parent or --child"
+                    "at one end, by --parent or --child"
                 )
             if frames.link in (parent, child) and self._known_link(name) is None:
                 found.append(StaticTransform(frames.link, frames.optical, self.link_from_optical(name)))
