@@ -304,10 +304,10 @@ class OnlineEstimate:
         self.stop_relinearization()
         window.dynamics.test_all()
         self.matcher.check_lower_edges(smoother.point)
-        live = window.objects.live
+        live, inflation = window.objects.live, self.uncertainty.inflation
         try:
             converged = relinearize_window(
-                smoother, self.matcher, NARROW_KERNELS_PX, max_iterations, live, self._share
+                smoother, self.matcher, NARROW_KERNELS_PX, max_iterations, live, self._share, inflation
             )
             self.uncertainty = Uncertainty.of(smoother)
             self.tests.run(smoother)

@@ -202,7 +202,7 @@ class Gaussian:
     def vector_with(self, others: Sequence[Gaussian]) -> FloatArray:
         """(n,) vector of the same, about this one's point."""
         vector = self.vector.copy()
-        for other in others:
+        for other in others if self.held else [other.without_held() for other in others]:
             vector[self.point.columns(other.point.tracks, other.held)] += other.at(self.point).vector
         return vector
 

@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 from sst_graph.batch.by_edges.optimum import CONVERGED_STEP
 from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX
 from sst_graph.batch.lower_edges import LowerEdgeSupport
+from sst_graph.errors import EstimationError
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.convergence import step_share
+from sst_graph.graph.linear import scaled_inverse
 from sst_graph.tracker.by_edges.kinds import by_edges
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.tracker.window.matcher import WindowMatcher
@@ -70,52 +72,63 @@ def relinearize_window(
     most: int,
     alive: Container[int],
     share: float = 1.0,
+    inflation: float = 1.0,
 ) -> bool:
     """Match all scans, solve, and again under the next kernel; then under the last until it converges.
 
     Matches made frame by frame keep the estimate within one or two standard deviations of the batch's. Where
     some matches appear and disappear in turn, the estimate oscillates, and the steps are shortened as in the
-    batch (:mod:`sst_graph.graph.convergence`).
+    batch (:mod:`sst_graph.graph.convergence`). The steps are Gauss-Newton's; the graph takes the last matches
+    only.
 
     Args:
-        kernels_px: scales of the robust kernel, one a step.
-        most: further steps under the last one.
         alive: tracks of objects that may be seen again.
         share: factor on the weights of all matches.
+        inflation: how much larger the estimate's covariance is than that of independent matches.
 
     Returns:
         Whether it converged.
 
     Raises:
-        EstimationError: an update fails; what the steps before it reached stays.
+        EstimationError: a step or the update fails; the estimate stays.
     """
-    at = smoother.point
+    at, converged = smoother.point, False
     for i in range(len(kernels_px) + most):
         kernel = RobustKernel("geman_mcclure", kernels_px[min(i, len(kernels_px) - 1)])
         found, missing = matcher.match(at, None, kernel, share)
-        smoother.update(found, missing, 0, alive)
-        smoother.optimize(_INNER)
-        last = i + 1 - len(kernels_px)
-        left = smoother.point.core().local(at.core())
-        n = len(left)
-        if last >= 0 and _is_short(left, smoother, matcher):
-            return True
-        back = np.zeros(smoother.point.size)
-        back[:n] = (1.0 - step_share(last)) * left
-        at = smoother.point.moved(back)
-    smoother.set_point(at)
-    return False
+        window = smoother.window_with(found, at)
+        P = _inverse(window.information)
+        step, m, last = P @ window.vector, at.core_size, i + 1 - len(kernels_px)
+        if last >= 0 and _is_short(step[:m], inflation * P[:m, :m], matcher):
+            converged = True
+            break
+        at = window.point.moved(step_share(last) * step)
+    smoother.update(found, missing, 0, alive)
+    smoother.optimize(_INNER)
+    if not converged:
+        smoother.set_point(at)
+    return converged
 
 
-def _is_short(step: FloatArray, smoother: WindowSmoother, matcher: WindowMatcher) -> bool:
-    """Whether a step of the estimate (m,) is so short that it has converged.
+def _inverse(information: FloatArray) -> FloatArray:
+    """(n, n) its inverse.
+
+    Raises:
+        EstimationError: there is none.
+    """
+    try:
+        return scaled_inverse(information)
+    except np.linalg.LinAlgError as error:
+        raise EstimationError(str(error)) from error
+
+
+def _is_short(step: FloatArray, P: FloatArray, matcher: WindowMatcher) -> bool:
+    """Whether a step of the estimate (m,) of covariance P (m, m) is so short that it has converged.
 
     Edges follow the pose, so that frozen matches are too sure: with them it is the batch's step.
     """
     if by_edges(matcher.classes):
         return bool((np.abs(step[:7]) < _EDGE_STEP).all())
-    n = len(step)
-    P = smoother.covariance()[0][:n, :n]
     return bool(step @ np.linalg.solve(P, step) < _CONVERGED_SIGMAS**2)
 
 

@@ -306,15 +306,34 @@ class WindowSmoother:
     def vector(self) -> FloatArray:
         """(n,) negative gradient of the cost of past and window by the last epoch, at the estimate, over the
         unknowns of ``past`` and what it holds."""
-        total = self.observed.at(self._point)
+        return self._with_pairs(self.observed.at(self._point), self.entries).vector
+
+    def window_with(self, found: Mapping[int, MatchedPair], point: Point) -> Gaussian:
+        """Past and window by the last epoch, about a point at which all scans were matched again; the motion of
+        each pair is marginalised out."""
+        places = {t: place for pair in found.values() for t, place in pair.linear.places.items()}
+        new = {t: place for t, place in places.items() if t not in self.past.point.tracks}
+        for track in new.keys() - set(point.tracks):
+            point = point.with_object(track, float(point.biases_px[places[track]]))
+        past = self.observed.without_held().with_objects(new, self.graph.object_bias_sigma_px)
+        return self._with_pairs(past.at(point), found)
+
+    def _with_pairs(self, past: Gaussian, pairs: Mapping[int, MatchedPair]) -> Gaussian:
+        """A past and pairs, by scan, on the last epoch, about the past's point."""
+        total, numbers = past, {scan: self._epoch_of(scan, pair) for scan, pair in pairs.items()}
         for i, epoch in enumerate(self._epochs):
             if i > 0:
                 total = total.drifted(self.walk(self._seconds(i)))
-            seen = [
-                entry.linear.information for entry in self.entries.values() if entry.epoch == epoch.number
-            ]
+            seen = [pair.linear.information for scan, pair in pairs.items() if numbers[scan] == epoch.number]
             total = Gaussian(total.point, total.information_with(seen), total.vector_with(seen))
-        return total.vector
+        return total
+
+    def _epoch_of(self, scan: int, pair: MatchedPair) -> int:
+        """Number of the epoch of a pair, which need not be in the graph."""
+        if scan in self.entries:
+            return self.entries[scan].epoch
+        begun = [epoch.number for epoch in self._epochs if epoch.start_ns <= pair.stamp_ns]
+        return max(begun, default=self._epochs[0].number)
 
     def static_information(self) -> FloatArray | None:
         """(n, n) the same by static objects alone; None where no match is of a dynamic one."""
