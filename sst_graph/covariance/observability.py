@@ -90,11 +90,14 @@ class ObservabilityConfig(Settings):
 def weak_directions(
     covariance: FloatArray, cTl: gtsam.Pose3, config: ObservabilityConfig, advice: Advice = SILHOUETTES
 ) -> tuple[WeakDirection, ...]:
-    """Directions whose standard deviation is past the limits, the weakest first.
+    """Directions whose standard deviation is past the limits, the weakest first; none where every unknown is
+    within its own.
 
     The eigenvectors of the (7, 7) covariance, each unknown measured in its own limit: an eigenvalue above
     1 is a combination known worse than the limits allow.
     """
+    if worst_ratio(covariance, config) <= 1.0:
+        return ()
     limits = limits_of_unknowns(covariance, config)
     scaled = covariance / np.outer(limits, limits)
     values, vectors = np.linalg.eigh(scaled)
@@ -104,6 +107,15 @@ def weak_directions(
             break
         found.append(_describe(limits * vector * np.sqrt(value), covariance, cTl, advice))
     return tuple(found)
+
+
+def worst_ratio(covariance: FloatArray, config: ObservabilityConfig) -> float:
+    """Largest standard deviation in units of its limit: of a rotation about any axis, a translation along any
+    axis, the time offset."""
+    limits = limits_of_unknowns(covariance, config)
+    scaled = covariance / np.outer(limits, limits)
+    parts = (scaled[own, own] for own in (slice(0, 3), slice(3, 6), slice(6, 7)))
+    return float(np.sqrt(max(np.linalg.eigvalsh(part)[-1] for part in parts)))
 
 
 def open_directions(

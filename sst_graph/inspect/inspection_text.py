@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.covariance.observability import worst_ratio
 from sst_graph.errors import count_of
 from sst_graph.inspect.budget_text import budget_lines
 from sst_graph.inspect.frame_information import FrameInformation
@@ -20,7 +21,7 @@ from sst_graph.inspect.inspection import (
     telling_frames,
 )
 from sst_graph.inspect.planning import MOST_FRAMES as MOST_RECORDED
-from sst_graph.inspect.planning import Plan, Prediction, worst_ratio
+from sst_graph.inspect.planning import Plan, Prediction
 from sst_graph.inspect.planning import limits_of as limits_of_result
 from sst_graph.inspect.verdict import fit_line
 from sst_graph.result import CalibrationResult

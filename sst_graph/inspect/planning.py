@@ -19,7 +19,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.covariance.observability import ObservabilityConfig, limits_of_unknowns
+from sst_graph.covariance.observability import ObservabilityConfig, worst_ratio
 from sst_graph.inspect.frame_information import (
     MAX_NUMBER,
     FrameInformation,
@@ -242,12 +242,6 @@ def _numbers(entry: Any) -> FloatArray | None:
     except (KeyError, TypeError, ValueError, OverflowError):
         return None
     return numbers if numbers.shape == (8,) and (np.abs(numbers) <= MAX_NUMBER).all() else None
-
-
-def worst_ratio(covariance: FloatArray, limits: ObservabilityConfig) -> float:
-    """Sigma of the direction known worst, each unknown measured in its limit."""
-    scale = limits_of_unknowns(covariance, limits)
-    return float(np.sqrt(np.linalg.eigvalsh(_scaled(covariance, scale))[-1]))
 
 
 def motion_proposals(

@@ -14,6 +14,7 @@ from sst_graph.covariance.observability import (
     ObservabilityConfig,
     inseparable_directions,
     weak_directions,
+    worst_ratio,
 )
 from sst_graph.inspect.reasons import short_reason
 from sst_graph.result import DIRECTION_SCALES
@@ -33,6 +34,25 @@ def with_direction(step: np.ndarray) -> np.ndarray:
 
 def test_a_good_covariance_has_none() -> None:
     assert weak_directions(GOOD, CTL, CONFIG) == ()
+
+
+def test_the_worst_ratio_is_that_of_one_unknown_or_of_any_axis() -> None:
+    sigmas = np.array([np.radians(0.25)] * 3 + [0.01, 0.01, 0.1] + [0.001])
+    assert worst_ratio(np.diag(sigmas**2), CONFIG) == pytest.approx(2.0)
+    diagonal = np.array([0.0, 0.0, 0.0, 0.08, 0.06, 0.0, 0.0])
+    assert worst_ratio(np.diag(np.full(7, 1e-12)) + np.outer(diagonal, diagonal), CONFIG) == pytest.approx(
+        2.0
+    )
+
+
+def test_unknowns_that_are_all_within_their_limits_are_never_weak() -> None:
+    """9.5 ms of 10 allowed and 3.5 cm of 5: the limits that are documented are those that count."""
+    near = GOOD + np.diag(np.square([0.0, 0.0, 0.0, 0.035, 0.0, 0.0, 0.0095]))
+    near[3, 6] = near[6, 3] = 0.5 * 0.035 * 0.0095
+    assert worst_ratio(near, CONFIG) < 1.0 and weak_directions(near, CTL, CONFIG) == ()
+    over = near + np.diag(np.square([0.0] * 6 + [0.005]))
+    (weak,) = weak_directions(over, CTL, CONFIG)
+    assert "the time offset is known to" in weak.sentence
 
 
 def test_forward_and_time_offset_are_named_together() -> None:

@@ -309,8 +309,8 @@ class WindowSmoother:
         return self._with_pairs(self.observed.at(self._point), self.entries).vector
 
     def window_with(self, found: Mapping[int, MatchedPair], point: Point) -> Gaussian:
-        """Past and window by the last epoch, about a point at which all scans were matched again; the motion of
-        each pair is marginalised out."""
+        """Past and window by the last epoch, about a point at which all scans were matched again, with the
+        motion of each pair marginalised out."""
         places = {t: place for pair in found.values() for t, place in pair.linear.places.items()}
         new = {t: place for t, place in places.items() if t not in self.past.point.tracks}
         for track in new.keys() - set(point.tracks):
