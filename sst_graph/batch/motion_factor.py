@@ -20,7 +20,7 @@ from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
 from sst_graph.graph.outer_loop import KERNELS_PX, solve_joint
 from sst_graph.graph.state import EXTRINSIC, State, difference, time_offset_key
-from sst_graph.hand_eye.solution import solve_motion
+from sst_graph.hand_eye.solution import MotionSolution, solve_motion
 from sst_graph.types import Guess
 
 FloatArray = NDArray[np.float64]
@@ -106,7 +106,10 @@ def fuse_motion(
         "sigma_time_offset_s": float(sigmas[6]),
     }
     if chi2 > MAX_DISAGREEMENT_CHI2 or not motion.converged:
-        return WithMotion(labels, _contradiction(step, chi2, motion.converged), facts)
+        return WithMotion(labels, _contradiction(step, chi2, motion), facts)
+    if motion.misfit is not None:
+        sentence = f"the motion was left out: {motion.misfit}"
+        return WithMotion(labels, diagnostics={"left_out": sentence, **facts}, remarks=(sentence,))
     worst = _worst_stretch(stretches, PartEstimate(step, motion.covariance))
     if worst is not None:
         facts["stretch_p_value"] = worst[1].p_value * len(stretches)
@@ -154,12 +157,13 @@ def _of_stretch(drives: Sequence[Drive], worst: tuple[SolvedPart, Difference], s
     )
 
 
-def _contradiction(step: FloatArray, chi2: float, converged: bool) -> tuple[str, ...]:
+def _contradiction(step: FloatArray, chi2: float, motion: MotionSolution) -> tuple[str, ...]:
     """A sentence about two solutions that differ; none where the motion did not converge by itself."""
-    if not converged:
+    if not motion.converged:
         return ()
     degrees, metres = np.degrees(np.linalg.norm(step[:3])), float(np.linalg.norm(step[3:6]))
     return (
         f"motion alone gives another calibration, {degrees:.2f} deg, {100 * metres:.0f} cm and "
-        f"{1e3 * step[6]:+.1f} ms away (chi-squared {chi2:.0f} of 7): labels or odometry are wrong",
+        f"{1e3 * step[6]:+.1f} ms away (chi-squared {chi2:.0f} of 7): labels or odometry are wrong"
+        + motion.doubt,
     )

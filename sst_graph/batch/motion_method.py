@@ -76,6 +76,8 @@ def _reasons(solutions: Sequence[MotionSolution]) -> tuple[str, ...]:
     reasons = []
     if not best.converged:
         reasons.append(f"the outer loop still moved after {count_of(best.outer_iterations, 'iteration')}")
+    if best.misfit is not None:
+        reasons.append(best.misfit)
     other = alternative(solutions)
     if other is not None:
         step = difference(best.state, other.state)

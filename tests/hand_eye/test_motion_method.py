@@ -139,6 +139,15 @@ def test_noise_scales_follow_the_residuals() -> None:
     assert NoiseScales() == NoiseScales(1.0, 1.0)
 
 
+def test_odometry_far_worse_than_its_noise_is_a_reason() -> None:
+    """Its covariance is scaled to fit; errors that are so large are not white, as it assumes."""
+    poor, fair = (
+        calibrate_prepared([made_drive(weaving, noise=noise)], TRUE, _config()) for noise in (8.0, 2.0)
+    )
+    assert poor.status == "not_converged" and "times worse than their noise" in " ".join(poor.reasons)
+    assert "times worse" not in " ".join(fair.reasons)
+
+
 def test_start_without_a_guess() -> None:
     drive = made_drive(weaving)
     starts = motion_starts(camera_steps([drive]), lidar_paths([drive]), Guess(None))

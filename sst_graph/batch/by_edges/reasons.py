@@ -126,7 +126,7 @@ def edges_reasons(
         if chi2 > MAX_MOTION_CHI2:
             reasons.append(
                 f"motion alone gives another calibration, {np.degrees(np.linalg.norm(step[:3])):.2f} deg and "
-                f"{1e3 * step[3]:+.1f} ms away (chi-squared {chi2:.0f} of 4)"
+                f"{1e3 * step[3]:+.1f} ms away (chi-squared {chi2:.0f} of 4)" + motion.doubt
             )
     return (*reasons, *far_reasons(solution.state.cTl, centre.cTl))
 
