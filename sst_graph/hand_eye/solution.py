@@ -46,7 +46,7 @@ MIN_PAIRS = 5
 MAX_NOISE_SCALE = 4.0
 """Odometry that fits worse than this many times its stated noise errs in ways that its covariance, which is
 scaled to fit, does not describe. On KITTI and on simulated streets the scales are 0.5 to 1.8. Where few
-features are in view and half of them move they are 5 to 9, and a time offset was 20 ms off at a sigma of 4."""
+features are in view and half of them move they are 5 to 9: a time offset was 20 ms off at a sigma of 4 ms."""
 _MAX_OUTER = 20
 """Most outer iterations: a bound on the time; what has not converged by then is reported."""
 _FIRST_OUTER = 4
