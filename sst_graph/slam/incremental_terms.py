@@ -20,7 +20,7 @@ from sst_graph.config import expect_settings
 from sst_graph.errors import EstimationError
 from sst_graph.factors import FactorError
 from sst_graph.factors.arguments import checked_count, checked_number, checked_type
-from sst_graph.factors.custom.variables import checked_key, key_name
+from sst_graph.factors.custom.variables import checked_key, expect_kinds, key_name
 from sst_graph.slam.alignment_keys import COLUMNS, AlignmentKeys
 from sst_graph.slam.alignment_term import AlignmentTerm, TermMatches, TermState
 from sst_graph.slam.checked_terms import checked_terms, expect_factors_of
@@ -351,8 +351,10 @@ class IncrementalTerms:
             if key not in new and not isam.valueExists(key):
                 expected = "a value for each key of the graph, of extrinsic, offset and biases"
                 raise FactorError(f"values of {where}", f"no {key_name(key)}", expected)
-        if not self._begun and new.issuperset(self._keys.lasting):
-            self._keys.check_kinds(values)
+        every = gtsam.Values(isam.getLinearizationPoint())
+        every.insert(values)
+        self._keys.check_kinds(every)
+        expect_kinds(f"values of {where}", every, factors)
 
     def _checked_stamps(
         self, where: str, stamps: Mapping[int, float] | None, values: gtsam.Values
