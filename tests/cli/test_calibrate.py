@@ -156,6 +156,12 @@ def test_nothing_is_replaced_without_overwrite(
         (["--set", "metod=paper"], "unknown setting 'metod'; did you mean 'method'?"),
         (["--set", "method=magic"], "found 'magic', expected one of"),
         (["--config", "none.toml"], "none.toml: found no such file"),
+        (["--sweep-start-deg", "90"], "sweep start 90.0 deg: found sweep auto, expected clockwise"),
+        (["--sweep", "instant", "--sweep-stamp", "end"], "whose points are all at the stamp"),
+        (["--method", "edges", "--classes", "vehicle"], "--classes vehicle: means nothing for method edges"),
+        (["--set", "method=motion", "--classes", "all"], "means nothing for method motion"),
+        (["--method", "motion", "--estimate", "focal"], "needs method joint, edges or both, found motion"),
+        (["--method", "paper", "--estimate", "k1=0.05,cy"], "assumptions.estimate=k1=0.05,cy needs"),
     ],
 )
 def test_bad_options(

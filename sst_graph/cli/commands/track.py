@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from sst_graph.batch.by_edges.choice import with_method_for
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.cli import EXIT_NOT_TRUSTED
-from sst_graph.cli.inputs import chosen_classes, settings, starting_point
+from sst_graph.cli.inputs import chosen_classes, refuse_unused_classes, settings, starting_point
 from sst_graph.cli.labels import check_classes
 from sst_graph.cli.messages import complain, say
 from sst_graph.cli.outputs import CHECKPOINT_FILE, RERUN_FILE, RESULT_FILE, check_apart
@@ -161,6 +161,7 @@ def _begun(args: argparse.Namespace, source: Source) -> tuple[Tracker, SweptSour
         "calibration.assumptions.estimate": None if args.estimate is None else args.estimate.split(","),
     }
     config = settings(TrackerConfig(), args, flags)
+    refuse_unused_classes(args.classes, config.calibration.method)
     check_classes([source], config.calibration.classes, args.classes)
     if args.init is not None:
         warn_of_other_pairs(args.init, options_of(args))
