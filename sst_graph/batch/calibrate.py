@@ -188,9 +188,9 @@ def _check(sources: Sequence[Source], config: CalibrationConfig) -> None:
     if config.time_offset_per_drive and config.method != "joint":
         raise ConfigError(f"time_offset_per_drive needs method joint, found {config.method}")
     if config.assumptions.estimate and config.method in _ESTIMATE_NO_ASSUMPTION:
-        names = ",".join(config.assumptions.estimate)
+        estimate = ",".join(config.assumptions.estimate)
         raise ConfigError(
-            f"assumptions.estimate={names} needs method joint, edges or both, found {config.method}"
+            f"assumptions.estimate={estimate} needs method joint, edges or both, found {config.method}"
         )
     if config.time_offset_per_drive and config.use_motion == "always":
         raise ConfigError("use_motion=always has one time offset only: leave out time_offset_per_drive")
