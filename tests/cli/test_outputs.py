@@ -274,6 +274,14 @@ def test_a_place_where_nothing_can_be_made(
     assert out in _refused(capsys, "experiment", "windows", "--out", out)
 
 
+@pytest.mark.parametrize(("name", "option"), [("fit", "--data"), ("fit", "--methods"), ("rigs", "--jobs")])
+def test_an_option_of_another_experiment_is_named(
+    capsys: pytest.CaptureFixture[str], name: str, option: str
+) -> None:
+    said = _refused(capsys, "experiment", name, option, "1")
+    assert f"{option}: means nothing for experiment {name}" in said
+
+
 @pytest.mark.parametrize("frames", ["0", "-1", "100001", str(10**18), str(10**400)])
 def test_frames_of_a_prediction_are_bounded(capsys: pytest.CaptureFixture[str], frames: str) -> None:
     assert "expected 1 or more, at most 100000" in _refused(capsys, "inspect", "none", "--next", frames)
