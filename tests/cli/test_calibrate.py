@@ -174,6 +174,19 @@ def test_bad_options(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_classes_of_a_drive_without_labels_are_reported(
+    street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bare = tmp_path / "drive/sequences/00"
+    bare.mkdir(parents=True)
+    for entry in (street / "sequences/00").iterdir():
+        if entry.name not in ("labels", "semantic_2"):
+            (bare / entry.name).symlink_to(entry)
+    options = ["--classes", "vehicle", "--init", "none", "--frames", "0:2", "--no-report"]
+    assert _calibrate(tmp_path / "drive", tmp_path / "result", *options) == 3
+    assert "note: --classes vehicle: without labels method edges is used" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("damage", "message"),
     [

@@ -31,6 +31,8 @@ from sst_graph.tracker.track_update import TrackUpdate
 from sst_graph.tracker.tracker import Tracker
 from sst_graph.types import Frame, Source
 
+_FRAMES_BETWEEN_SAVES = 50
+
 if TYPE_CHECKING:
     from sst_graph.viewer import TrackerView
 
@@ -139,6 +141,10 @@ def _check(args: argparse.Namespace) -> None:
         rerun()
     if args.resume and args.checkpoint is None:
         raise ConfigError("--resume needs --checkpoint FILE")
+    if args.checkpoint_every is not None and args.checkpoint is None:
+        raise ConfigError("--checkpoint-every needs --checkpoint FILE")
+    if args.checkpoint_every is None:
+        args.checkpoint_every = _FRAMES_BETWEEN_SAVES
     if args.checkpoint_every < 1:
         raise ConfigError(f"--checkpoint-every {args.checkpoint_every}: expected 1 or more")
     if args.checkpoint is not None and args.checkpoint.exists() and not (args.resume or args.overwrite):
