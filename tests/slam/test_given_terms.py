@@ -211,3 +211,22 @@ def test_terms_compare_by_identity() -> None:
     )
     matches = terms[0].matched(_problem()[1], 40.0)
     assert matches == matches and matches != terms[0].matched(_problem()[1], 40.0)
+
+
+class _Uncopied(Trajectory):
+    """Of hours at 10 Hz a copy takes milliseconds, and each term would take several at every update."""
+
+    @property
+    def keys(self) -> tuple[int, ...]:
+        raise AssertionError("the keys were copied")
+
+    @property
+    def stamps_ns(self) -> tuple[int, ...]:
+        raise AssertionError("the stamps were copied")
+
+
+def test_a_term_finds_its_place_without_a_copy_of_the_trajectory() -> None:
+    trajectory = _Uncopied([X(k) for k in range(len(STREET.scans))], STREET.stamps_ns)
+    keys = AlignmentKeys(trajectory, STREET.cTl, STREET.time_offset_s)
+    matches = STREET.term(3, keys).matched(_problem()[1], 40.0)
+    assert matches.state == TermState.MATCHED
