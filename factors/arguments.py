@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+from collections.abc import Callable
 from typing import Any
 
 import gtsam
@@ -36,14 +37,23 @@ def checked_callback(what: str, value: Any, parameters: tuple[str, ...]) -> None
     expected = f"a function of ({', '.join(parameters)}), or None"
     if not callable(value):
         raise FactorError(what, described(value), expected)
+    if (other := other_signature(value, parameters)) is not None:
+        raise FactorError(what, f"one with the arguments {other}", expected)
+
+
+def other_signature(
+    function: Callable[..., Any], parameters: tuple[str, ...], keywords: tuple[str, ...] = ()
+) -> str | None:
+    """The signature of a function that cannot be called with these arguments, and these by their names."""
     try:
-        signature = inspect.signature(value)
+        signature = inspect.signature(function)
     except (TypeError, ValueError):  # some that are written in C do not tell theirs
-        return
+        return None
     try:
-        signature.bind(*parameters)
+        signature.bind(*parameters, **dict.fromkeys(keywords))
     except TypeError:
-        raise FactorError(what, f"one with the arguments {signature}", expected) from None
+        return str(signature)
+    return None
 
 
 def checked_gtsam(what: str, value: Any, kind: type) -> None:
@@ -98,7 +108,8 @@ def as_numbers(what: str, value: ArrayLike, shape: str = "") -> FloatArray:
             raise TypeError
         return np.asarray(array, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise FactorError(what, described(value), expected) from None
+        of_kind = f" of {value.dtype}" if isinstance(value, np.ndarray) else ""
+        raise FactorError(what, described(value) + of_kind, expected) from None
 
 
 def masked_values(value: object) -> int:

@@ -161,7 +161,7 @@ class CameraTwist:
             object.__setattr__(self, name, rows)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RigidlyMoved:
     """Points that share one tau.
 
@@ -199,7 +199,7 @@ class RigidlyMoved:
         _write_wrenches(self.cPs, g, out)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class GroupsMoved:
     """Groups of points, each of one image and one tau, so that every group moves as one rigid body.
 
@@ -242,7 +242,7 @@ class _Exponential(NamedTuple):
         return cls(x, b, c, b_x, c_x, wv, cross(omega, wv))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PointwiseMoved:
     """Points with a tau each.
 

@@ -69,13 +69,13 @@ def pose_alignment_factor(
         FactorError: keys that make no factor, or several accelerations; see also
             :func:`sst_graph.factors.frame_factor`.
     """
-    checked_type(f"between of {_NAME}", between, Between, "a sst_graph.factors.Between")
+    checked_type(f"between of {NAME}", between, Between, "a sst_graph.factors.Between")
     expected = "a gtsam.noiseModel of dimension 1, or None"
-    checked_type(f"noise of {_NAME}", noise, (gtsam.noiseModel.Base, type(None)), expected)
+    checked_type(f"noise of {NAME}", noise, (gtsam.noiseModel.Base, type(None)), expected)
     if noise is not None and noise.dim() != 1:
-        raise FactorError(f"noise of {_NAME}", f"dimension {noise.dim()}", "dimension 1, for the whole image")
-    E, D = pose_or_key(_NAME, "cTl", cTl), number_or_key(_NAME, "time_offset_s", time_offset_s)
-    inner = frame_residual(alignments, Quantities(_EXTRINSIC, D, between.X_a), biases_px, name=_NAME)
+        raise FactorError(f"noise of {NAME}", f"dimension {noise.dim()}", "dimension 1, for the whole image")
+    E, D = pose_or_key(NAME, "cTl", cTl), number_or_key(NAME, "time_offset_s", time_offset_s)
+    inner = frame_residual(alignments, Quantities(_EXTRINSIC, D, between.X_a), biases_px, name=NAME)
     arguments = [
         Argument("X_a", between.X_a, gtsam.Pose3),
         Argument("X_b", between.X_b, gtsam.Pose3),
@@ -88,8 +88,8 @@ def pose_alignment_factor(
         for name, key in inner.variables.named.items()
         if name.startswith("bias")
     ]
-    variables, acceleration = Variables.of(_NAME, arguments), _common_acceleration(alignments)
-    return image_factor(_PoseFrame(inner, variables, between, E, D, acceleration), noise, _NAME)
+    variables, acceleration = Variables.of(NAME, arguments), _common_acceleration(alignments)
+    return image_factor(_PoseFrame(inner, variables, between, E, D, acceleration), noise, NAME)
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,7 @@ class _PoseFrame:
 
 _EXTRINSIC = 2**64 - 1
 """Stands for the extrinsic in effect among the inner residual's keys; gtsam.symbol makes no such key."""
-_NAME = "pose_alignment_factor"
+NAME = "pose_alignment_factor"
 
 
 def _common_acceleration(alignments: Sequence[Alignment]) -> FloatArray:

@@ -21,7 +21,13 @@ from numpy.typing import NDArray
 from sst_graph.errors import DataError
 from sst_graph.factors.arguments import checked_type
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.files.checked_values import check_covariance, check_finite, checked_text, pinhole_camera
+from sst_graph.files.checked_values import (
+    check_covariance,
+    check_finite,
+    checked_text,
+    pinhole_camera,
+    read_only,
+)
 from sst_graph.files.json_table import JsonTable, json_table
 from sst_graph.files.reading import CALIBRATION, parse_json, path_of, read_text
 from sst_graph.files.strict_json import strict_json
@@ -165,6 +171,7 @@ class CalibrationResult:
         check_finite("time_offset_s", np.asarray(self.time_offset_s), ())
         check_finite("covariance", self.covariance, (7, 7))
         check_covariance("covariance", self.covariance, min_sigma=0.0)
+        object.__setattr__(self, "covariance", read_only(self.covariance))
         for weak in self.weak_directions:
             check_finite("weak_directions.vector", np.asarray(weak.vector), (7,))
             check_finite("weak_directions.sigma", np.asarray(weak.sigma), ())

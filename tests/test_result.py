@@ -21,6 +21,7 @@ from sst_graph.result import (
     WeakDirection,
     read_result,
 )
+from sst_graph.rig.result import RigResult
 from sst_graph.types import Frame, GroundTruth, Scan, SemanticClass
 
 POSE = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.4, -0.2, 1.0), [0.1, -0.2, 0.3])
@@ -267,3 +268,18 @@ def test_names_that_are_not_unicode_make_a_valid_file(tmp_path: Path) -> None:
     path = tmp_path / "calibration.json"
     path.write_bytes(result.to_json().encode("utf-8"))
     assert read_result(path).frames_used == (FrameId("stra\\udcdfe", 3),) and "ä" in path.read_text()
+
+
+def test_a_result_does_not_change_with_the_array_it_was_made_of() -> None:
+    covariance = 1e-6 * np.eye(7)
+    result = CalibrationResult(
+        gtsam.Pose3(), 0.1, covariance, "ok", PinholeCamera(50.0, 50.0, 50.0, 50.0, 99, 99)
+    )
+    text = result.to_json()
+    covariance[0, 0] = 1.0
+    assert result.to_json() == text
+    with pytest.raises(ValueError, match="read-only"):
+        result.covariance[0, 0] = 1.0
+    rig = RigResult({"a": result}, covariance, "ok")
+    covariance[0, 0] = 2.0
+    assert rig.covariance[0, 0] == 1.0

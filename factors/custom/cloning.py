@@ -62,12 +62,18 @@ def rekeyed(factor: gtsam.NonlinearFactor, new_keys: Mapping[int, int]) -> gtsam
         for old, key in new_keys.items()
     }
     if not isinstance(factor, gtsam.CustomFactor):
-        return factor.rekey([new.get(int(key), int(key)) for key in list(factor.keys())])
+        old = [int(key) for key in list(factor.keys())]
+        return factor.rekey(_distinct([new.get(key, key) for key in old], len(set(old))))
     recipe = own_recipe(factor)
-    keys = [new.get(key, key) for key in recipe.keys]
-    if len(set(keys)) != len(keys):
-        raise FactorError("new_keys of rekeyed", "one key for two variables", "distinct keys")
+    keys = _distinct([new.get(key, key) for key in recipe.keys], len(recipe.keys))
     return replace(recipe, keys=dict(zip(keys, recipe.keys.values(), strict=True))).build()
+
+
+def _distinct(keys: list[int], variables: int) -> list[int]:
+    """The new keys, where they are as many as the variables."""
+    if len(set(keys)) != variables:
+        raise FactorError("new_keys of rekeyed", "one key for two variables", "distinct keys")
+    return keys
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arguments import checked_count, checked_type, described
+from ..arguments import as_numbers, checked_count, checked_type, described, other_signature
 from ..errors import FactorError, count_of
 from .variables import Kind, Reader, checked_key, checked_keys, dimension, key_name
 
@@ -86,12 +86,13 @@ class FactorRecipe:
                 request.append(self)
                 return np.zeros(rows)
             arguments = [reader.read(values) for reader in readers]
-            error, jacobians = function(*arguments, jacobians=H is not None)
+            error, jacobians = _returned(name, function(*arguments, jacobians=H is not None))
             error = _checked(f"error of {name} on", keys, error, (rows,))
             if H is not None:
-                if jacobians is None or len(jacobians) != len(keys):
-                    found = "None" if jacobians is None else f"{len(jacobians)}"
-                    raise FactorError(f"Jacobians of {name}", found, f"{len(keys)}, one for each key")
+                if not isinstance(jacobians, list | tuple | np.ndarray) or len(jacobians) != len(keys):
+                    raise FactorError(
+                        f"Jacobians of {name}", described(jacobians), f"{len(keys)}, one for each key"
+                    )
                 for i, (key, shape) in enumerate(zip(keys, shapes, strict=True)):
                     H[i] = _checked(f"Jacobian of {name} by", [key], jacobians[i], shape, fortran=True)
             return error
@@ -158,16 +159,30 @@ def custom_factor(
     checked_type("name of a factor", name, str, "a str")
     named = checked_keys(name, keys)
     kinds = tuple(dims) if isinstance(dims, list) else dims
-    return FactorRecipe(noise, named, function, kinds, rows, name).build()  # type: ignore[arg-type]  # checked
+    recipe = FactorRecipe(noise, named, function, kinds, rows, name)  # type: ignore[arg-type]  # checked
+    values = tuple(f"value_{i}" for i in range(len(named)))
+    if (other := other_signature(function, values, ("jacobians",))) is not None:
+        expected = f"({', '.join(values)}, *, jacobians)"
+        raise FactorError(f"function of {name}", f"one with the arguments {other}", expected)
+    return recipe.build()
+
+
+def _returned(name: str, pair: Any) -> tuple[Any, Any]:
+    """Error and Jacobians that a function has returned."""
+    if not isinstance(pair, tuple | list) or len(pair) != 2:
+        raise FactorError(
+            f"what the function of {name} returns", described(pair), "(error, Jacobians or None)"
+        )
+    return pair[0], pair[1]
 
 
 def _checked(
     what: str, keys: Sequence[int], value: Any, shape: tuple[int, ...], fortran: bool = False
 ) -> FloatArray:
     try:
-        array = np.asarray(value, dtype=np.float64, order="F" if fortran else None)
-    except (TypeError, ValueError):
-        raise FactorError(f"{what} {_names(keys)}", described(value), f"shape {shape}") from None
+        array = np.asarray(as_numbers(what, value), order="F" if fortran else None)
+    except FactorError as error:
+        raise FactorError(f"{what} {_names(keys)}", error.found, f"numbers of shape {shape}") from None
     if array.shape != shape:
         raise FactorError(f"{what} {_names(keys)}", f"shape {array.shape}", f"shape {shape}")
     if not np.isfinite(array).all():

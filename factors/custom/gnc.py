@@ -53,7 +53,7 @@ class GncParams:
             raise FactorError("weights_tolerance", described(self.weights_tolerance), "above 0 and below 0.5")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class GncSolution:
     """What :func:`gnc` found.
 

@@ -16,7 +16,7 @@ from .variables import checked_values
 FloatArray = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class JacobianBlock:
     """One variable's derivative: the analytic and the numerical one, and their greatest difference.
 
@@ -42,7 +42,7 @@ class JacobianBlock:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class JacobianReport:
     """What :func:`check_jacobians` and :func:`check_gradient` found, by variable."""
 

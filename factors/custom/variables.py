@@ -115,11 +115,43 @@ def number_or_key(factor: str, argument: str, value: Any) -> int | float:
 def checked_values(
     what: str, values: Any, factors: Iterable[gtsam.NonlinearFactor], further: Iterable[int] = ()
 ) -> None:
-    """Nothing, where ``values`` has one for each key of the factors, and for the further keys."""
+    """Nothing, where ``values`` has one of its kind for each key of the factors, and the further keys.
+
+    Raises:
+        FactorError: a value is missing, or of another kind; or as the callback of a factor raises.
+    """
     checked_type(what, values, gtsam.Values, "a gtsam.Values")
+    factors = list(factors)
     for key in sorted({*further, *(int(key) for factor in factors for key in list(factor.keys()))}):
         if not values.exists(key):
             raise FactorError(what, f"no {key_name(key)}", "a value for each key of the graph")
+    expect_kinds(what, values, factors)
+
+
+def expect_kinds(what: str, values: gtsam.Values, factors: Iterable[gtsam.NonlinearFactor]) -> None:
+    """Nothing, where every factor can be evaluated: its values are of the kinds that it wants.
+
+    Raises:
+        FactorError: one is not; or as the callback of a factor raises.
+    """
+    for factor in factors:
+        try:
+            factor.error(values)
+        except RuntimeError as error:
+            message = str(error)
+            stored, wanted = _stored_type(message), _type_after("requested type was ", message)
+            if not stored:  # another error than that of a kind
+                raise
+            stored, wanted = (name.replace("Double", "double") for name in (stored, wanted))
+            raise FactorError(
+                what, f"{stored} for {_key_in(message)}", f"{wanted}, as a factor wants it"
+            ) from None
+        except ValueError as error:
+            if "NoiseModel has dimension" not in str(error):
+                raise
+            keys = ", ".join(key_name(int(key)) for key in list(factor.keys()))
+            found = f"a size for {keys} that is not that of the noise of {type(factor).__name__}"
+            raise FactorError(what, found, "the size that the factor has") from None
 
 
 def checked_problem(where: str, graph: Any, values: Any, further: Iterable[int] = ()) -> None:
@@ -336,8 +368,19 @@ class Reader:
 
 
 def _stored_type(message: str) -> str:
-    """The name in ``at<name>`` of the type that gtsam's message says is stored."""
-    found = re.search(r"stored in Values is (.*) but requested type", message)
+    """The name in ``at<name>`` of the type that gtsam's message says is stored; '' where it says none."""
+    return _type_after("stored in Values is ", message)
+
+
+def _key_in(message: str) -> str:
+    """The key that gtsam's message names."""
+    found = re.search(r'with key "(.*?)"', message)
+    return found.group(1) if found else "a variable"
+
+
+def _type_after(words: str, message: str) -> str:
+    """The type that gtsam's message names after some words, by its name in Python."""
+    found = re.search(words + r"(.*?)(?: but requested type|$)", message, re.MULTILINE)
     name = found.group(1) if found else ""
     generic = re.fullmatch(r"gtsam::GenericValue<(.*?) ?>", name)
     name = generic.group(1) if generic else name

@@ -187,6 +187,11 @@ def _check(sources: Sequence[Source], config: CalibrationConfig) -> None:
         raise ConfigError(f"time_offset_per_drive needs drives of different names, found {names}")
     if config.time_offset_per_drive and config.method != "joint":
         raise ConfigError(f"time_offset_per_drive needs method joint, found {config.method}")
+    if config.assumptions.estimate and config.method in _ESTIMATE_NO_ASSUMPTION:
+        estimate = ",".join(config.assumptions.estimate)
+        raise ConfigError(
+            f"assumptions.estimate={estimate} needs method joint, edges or both, found {config.method}"
+        )
     if config.time_offset_per_drive and config.use_motion == "always":
         raise ConfigError("use_motion=always has one time offset only: leave out time_offset_per_drive")
 
@@ -275,5 +280,7 @@ _METHODS: dict[Method, _Method] = {
 }
 _NEED_IMAGE_TRACKS = ("paper", "static", "motion", "edges", "both")
 """Methods whose camera velocity comes from visual odometry."""
+_ESTIMATE_NO_ASSUMPTION = ("paper", "static", "semalign", "motion")
+"""Methods whose graph has no variable for an assumption."""
 _NEED_DEPTH = ("paper", "static")
 """Methods that take the metric scale of that velocity from LiDAR points."""

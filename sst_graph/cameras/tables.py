@@ -20,7 +20,7 @@ def parse_kitti_raw(text: str, place: str | Path = "calibration") -> dict[str, N
     ``calib_imu_to_velo.txt``; other lines (``calib_time``) are left out.
 
     Raises:
-        DataError: a value of theirs is no finite number.
+        DataError: a value of theirs is no finite number, or two lines of one key differ.
     """
     lines: dict[str, NDArray[np.float64]] = {}
     for number, line in enumerate(text.splitlines(), 1):
@@ -35,7 +35,9 @@ def parse_kitti_raw(text: str, place: str | Path = "calibration") -> dict[str, N
             raise DataError(
                 f"{place}:{number}", f"{words.strip()!r:.60}", f"finite numbers for {name.strip()}"
             )
-        lines[name.strip()] = values
+        if not np.array_equal(lines.setdefault(name.strip(), values), values):
+            found = f"another {name.strip()} than above"
+            raise DataError(f"{place}:{number}", found, f"one line {name.strip()}")
     return lines
 
 

@@ -79,7 +79,19 @@ def calibration_settings(args: argparse.Namespace) -> CalibrationConfig:
         "time_offset_per_drive": args.time_offset_per_drive,
         "assumptions.estimate": None if args.estimate is None else args.estimate.split(","),
     }
-    return settings(CalibrationConfig(), args, flags)
+    config = settings(CalibrationConfig(), args, flags)
+    refuse_unused_classes(args.classes, config.method)
+    return config
+
+
+def refuse_unused_classes(classes: str | None, method: str) -> None:
+    """Nothing, where classes were not named, or the method that was named aligns some.
+
+    Raises:
+        ConfigError: it does not.
+    """
+    if classes is not None and method in ("edges", "motion"):
+        raise ConfigError(f"--classes {classes}: means nothing for method {method}, which reads no labels")
 
 
 def chosen_classes(text: str | None) -> list[str] | None:

@@ -26,7 +26,8 @@ from sst_graph.types import Source
 PAIRING = ("image_shift", "camera", "image_topic", "info_topic", "stamps")
 """Options without which a result means something else: they may not be contradicted."""
 
-MEASUREMENT = ("cloud", "sweep", "cloud_topic", "mask_topic", "label_encoding", *LABEL_OPTIONS)
+OF_A_TURN = ("sweep_start_deg", "sweep_stamp")
+MEASUREMENT = ("cloud", "sweep", *OF_A_TURN, "cloud_topic", "mask_topic", "label_encoding", *LABEL_OPTIONS)
 """Options that change what is measured; another choice is allowed, and said."""
 
 OF_ONE_DRIVE = ("sequence", "frames")
@@ -71,6 +72,9 @@ def open_drive_of(args: argparse.Namespace, path: Path, result: CalibrationResul
     options = dict(SOURCE_DEFAULTS)
     options |= {name: stored[name] for name in (*PAIRING, *MEASUREMENT) if name in stored}
     options |= {name: None for name in LABEL_OPTIONS if not _is_here(options[name])}
+    if args.sweep not in (None, options["sweep"]):
+        # Start and stamp of a turn go with the sweep that they were given with.
+        options |= {name: SOURCE_DEFAULTS[name] for name in OF_A_TURN}
     options |= {name: getattr(args, name) for name in SOURCE_DEFAULTS if getattr(args, name) is not None}
     source, options = _opened_like(args, path, options, stored, {one.drive for one in result.frames_used})
     for name, value in options.items():

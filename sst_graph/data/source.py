@@ -22,6 +22,8 @@ Stamps = Literal["header", "received"]
 SWEEPS: tuple[Sweep, ...] = get_args(Sweep)
 TURNS = {"clockwise": -1.0, "azimuth": -1.0, "counterclockwise": 1.0}
 """Share of the sweep in the points, as :class:`~sst_graph.sweep_timing.SweepTiming` counts it."""
+AT_THE_STAMP = ("compensated", "instant")
+"""Sweeps whose points are all taken for measured at the scan's stamp."""
 STAMPS: tuple[Stamps, ...] = get_args(Stamps)
 LABEL_ENCODINGS: tuple[LabelEncoding, ...] = get_args(LabelEncoding)
 
@@ -95,6 +97,15 @@ class SourceOptions:
                 raise ConfigError(f"{what} {choice!r:.60}: expected one of {choices}")
         if not -360.0 <= self.sweep_start_deg <= 360.0:
             raise ConfigError(f"sweep start {self.sweep_start_deg} deg: expected -360 to 360")
+        if self.sweep_start_deg != SourceOptions.sweep_start_deg and self.sweep not in TURNS:
+            what = f"sweep start {self.sweep_start_deg} deg"
+            raise ConfigError(
+                f"{what}: found sweep {self.sweep}, expected clockwise or counterclockwise with it"
+            )
+        if self.sweep_stamp != SourceOptions.sweep_stamp and self.sweep in AT_THE_STAMP:
+            raise ConfigError(
+                f"sweep stamp {self.sweep_stamp}: found sweep {self.sweep}, whose points are all at the stamp"
+            )
         if self.frames is not None:
             _check_frames(self.frames)
 

@@ -77,6 +77,13 @@ def is_number(value: Any) -> TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MAX_SIGMA
 
 
+def read_only(values: FloatArray) -> FloatArray:
+    """A copy that cannot be written to: what is frozen does not change with the caller's array."""
+    copy = np.array(values, dtype=np.float64)
+    copy.flags.writeable = False
+    return copy
+
+
 def check_covariance(place: str, covariance: FloatArray, min_sigma: float = MIN_SIGMA) -> None:
     """Require a covariance: finite, symmetric, positive semi-definite but for rounding, sane sigmas.
 

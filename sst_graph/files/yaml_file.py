@@ -24,7 +24,7 @@ def parse_yaml(text: str, place: str | Path) -> dict[str, Any]:
     """The table in a YAML text; a matrix of OpenCV is a table of rows, cols, dt, data.
 
     Raises:
-        DataError: no YAML, anchors and aliases, tags of objects, deep nesting, no table.
+        DataError: no YAML, anchors and aliases, tags of objects, deep nesting, a name twice, no table.
         MissingDependencyError: PyYAML is not installed.
     """
     try:
@@ -38,7 +38,14 @@ def parse_yaml(text: str, place: str | Path) -> dict[str, Any]:
         text = text.partition("\n")[2]
 
     class Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
-        """Numbers, text, lists and tables, and OpenCV's matrices."""
+        """Numbers, text, lists and tables of distinct names, and OpenCV's matrices."""
+
+        def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+            names = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+            if len(set(names)) < len(names):
+                twice = next(name for k, name in enumerate(names) if name in names[:k])
+                raise ValueError(f"{twice!r:.60} twice in one table")
+            return super().construct_mapping(node, deep)
 
     def matrix(loader: Any, node: Any) -> Any:
         return loader.construct_mapping(node, deep=True)

@@ -35,16 +35,22 @@ def short(value: float) -> str:
 def gained_lines(result: CalibrationResult, gained: Gained | None, all_frames: bool) -> list[str]:
     """The block about frames of a result that keeps no view of them."""
     if gained is None or not gained.gains:
-        why = _NOTHING.get(result.method, "it was not written beside this result")
+        unused = not result.frames_used and result.method not in _NOTHING
+        why = (
+            "no frame was used"
+            if unused
+            else _NOTHING.get(result.method, "it was not written beside this result")
+        )
         return [
             f"what each frame brought is not known for this result of method {result.method}: {why}",
-            "- what to record next is predicted from results of calibrate --method joint only",
+            "- what to record next is not predicted either" if unused else _JOINT_ONLY,
         ]
     if gained.kind == "as they came":
         return [*_arrivals(gained.gains, all_frames), *_NO_PLAN]
     return [*_pairs(gained.gains, all_frames), *_NO_PLAN]
 
 
+_JOINT_ONLY = "- what to record next is predicted from results of calibrate --method joint only"
 _NO_PLAN = ("- what to record next is not predicted: this result keeps no view of its frames (joint does)",)
 
 

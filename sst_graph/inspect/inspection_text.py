@@ -175,8 +175,10 @@ def _weak_block(inspection: Inspection) -> list[str]:
     if result.weak_directions:
         lines = ["weak directions (past the limits), the weakest first"]
         return lines + [f"- {weak.sentence}: {weak.advice}" for weak in result.weak_directions]
+    past = "none named by this result, whose sigmas are past the limits"
+    named = past if ratio > 1.0 else "none past the limits"
     return [
-        "weak directions: none past the limits",
+        f"weak directions: {named}",
         f"- the weakest, at {short(ratio)} of its limit: {inspection.weakest.sentence}",
     ]
 

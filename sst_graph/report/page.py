@@ -165,7 +165,11 @@ def _verdict(inputs: ReportInputs) -> str:
 
 def _next(inspection: Inspection) -> str:
     result = inspection.result
-    weak = [f"{one.sentence}: {one.advice}." for one in result.weak_directions]
+    weak = [
+        f"{one.sentence}: {one.advice}"
+        for one in result.weak_directions
+        if not any(one.sentence in reason for reason in result.reasons)
+    ]
     nothing = f"No direction is past its limit. The weakest: {inspection.weakest.sentence}."
     short = [as_sentence(reason[0].upper() + reason[1:]) for reason in short_reasons(result)]
     advice = [] if inspection.plan is None else advice_sentences(inspection, inspection.plan)

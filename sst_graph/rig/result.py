@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.factors.arguments import checked_type
-from sst_graph.files.checked_values import check_covariance, check_finite
+from sst_graph.files.checked_values import check_covariance, check_finite, read_only
 from sst_graph.files.json_table import JsonTable, json_table
 from sst_graph.files.reading import FileKind, parse_json, path_of, read_text
 from sst_graph.files.strict_json import strict_json
@@ -70,6 +70,7 @@ class RigResult:
         check_status(self.status)
         check_finite("covariance", self.covariance, (n, n))
         check_covariance("covariance", self.covariance, min_sigma=0.0)
+        object.__setattr__(self, "covariance", read_only(self.covariance))
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, RigResult):

@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError, count_of
-from sst_graph.factors.arguments import checked_type
-from sst_graph.factors.custom.variables import body_in_lidar, checked_key, number_or_key, pose_or_key
+from sst_graph.factors import FactorError, Vector
+from sst_graph.factors.arguments import checked_finite, checked_gtsam, checked_type
+from sst_graph.factors.custom.variables import (
+    Kind,
+    Reader,
+    body_in_lidar,
+    checked_key,
+    key_name,
+    number_or_key,
+    pose_or_key,
+)
 from sst_graph.types import SemanticClass
 from sst_graph.validation import checked_stamp
 
@@ -45,6 +56,7 @@ class Trajectory:
             checked_type(f"{name} of Trajectory", given, Iterable, "one for each pose, in the order of time")
         self._keys: list[int] = []
         self._stamps: list[int] = []
+        self._known: set[int] = set()
         keys, stamps = list(keys), list(stamps_ns)
         if len(keys) != len(stamps):
             raise DataError(
@@ -58,18 +70,24 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self._keys)
 
+    def __contains__(self, key: object) -> bool:
+        return key in self._known
+
     def append(self, key: int, stamp_ns: int) -> None:
         """Add the pose after all others.
 
         Raises:
             DataError: no stamp, or one that is no later than the last.
-            FactorError: no key.
+            FactorError: no key, or that of an earlier pose.
         """
         key = checked_key("Trajectory", "key", key)
+        if key in self._known:
+            raise FactorError("keys of Trajectory", f"{key_name(key)} twice", "distinct keys")
         stamp_ns = checked_stamp(stamp_ns, "a pose")
         if self._stamps and stamp_ns <= self._stamps[-1]:
             raise DataError("stamp of a pose", f"{stamp_ns} ns", f"a stamp after {self._stamps[-1]} ns")
         self._keys.append(key)
+        self._known.add(key)
         self._stamps.append(stamp_ns)
 
     @property
@@ -80,16 +98,20 @@ class Trajectory:
     def stamps_ns(self) -> tuple[int, ...]:
         return tuple(self._stamps)
 
+    def at(self, position: int) -> tuple[int, int]:
+        """Key and stamp [ns] of the pose at a position."""
+        return self._keys[position], self._stamps[position]
+
     def position(self, stamp_ns: int) -> int | None:
         """Position of the pose with just this stamp; None where there is none."""
-        at = int(np.searchsorted(self._stamps, stamp_ns))
+        at = bisect_left(self._stamps, stamp_ns)
         return at if at < len(self) and self._stamps[at] == stamp_ns else None
 
     def interval(self, true_ns: float) -> int | None:
         """Position of the pose before a time that lies between two poses; None outside of all."""
         if len(self) < 2 or not self._stamps[0] <= true_ns <= self._stamps[-1]:
             return None
-        return int(np.clip(np.searchsorted(self._stamps, true_ns, "right") - 1, 0, len(self) - 2))
+        return min(bisect_right(self._stamps, true_ns) - 1, len(self) - 2)
 
     def outside_s(self, true_ns: float) -> float:
         """How far a time lies after the last pose (positive) or before the first (negative) [s]."""
@@ -106,7 +128,7 @@ class Trajectory:
         if not (values.exists(a) and values.exists(b)):
             return None
         seconds = 1e-9 * (self._stamps[position + 1] - self._stamps[position])
-        return np.asarray(gtsam.Pose3.Logmap(values.atPose3(a).between(values.atPose3(b)))) / seconds
+        return np.asarray(gtsam.Pose3.Logmap(body_pose(values, a).between(body_pose(values, b)))) / seconds
 
     def acceleration(self, values: gtsam.Values, position: int) -> FloatArray:
         """(6,) rate of change of the body's twist at the middle of an interval, from its neighbours."""
@@ -131,7 +153,8 @@ class AlignmentKeys:
         bTl: pose of the LiDAR in the body; None where the poses are the LiDAR's own.
 
     Raises:
-        FactorError: no trajectory, no keys, or constants that are none.
+        FactorError: no trajectory, no keys, one key for two variables (classes may share a bias), or
+            constants that are none.
     """
 
     trajectory: Trajectory
@@ -152,15 +175,54 @@ class AlignmentKeys:
             checked_type("biases_px of AlignmentKeys", c, SemanticClass, expected)
         biases = {c: number_or_key(place, "biases_px", bias) for c, bias in self.biases_px.items()}
         object.__setattr__(self, "biases_px", biases)
+        used: dict[int, str] = {}
+        given = [("cTl", self.cTl), ("time_offset_s", self.time_offset_s)]
+        given += [("biases_px", key) for key in dict.fromkeys(biases.values())]
+        for name, key in given:
+            if not isinstance(key, int):
+                continue
+            other = used.get(key) or ("a pose of the trajectory" if key in self.trajectory else None)
+            if other is not None:
+                raise FactorError(
+                    f"keys of {place}", f"{key_name(key)} for {other} and {name}", "distinct keys"
+                )
+            used[key] = name
+
+    def is_same_camera(self, other: AlignmentKeys) -> bool:
+        """Whether both name one extrinsic, one time offset and the same mask biases."""
+        if isinstance(self.cTl, gtsam.Pose3) and isinstance(other.cTl, gtsam.Pose3):
+            same_pose = self.cTl.equals(other.cTl, 0.0)
+        else:
+            same_pose = self.cTl == other.cTl
+        offsets = self.time_offset_s, other.time_offset_s
+        return (
+            same_pose
+            and offsets[0] == offsets[1]
+            and type(offsets[0]) is type(offsets[1])
+            and self.biases_px == other.biases_px
+        )
 
     def extrinsic(self, values: gtsam.Values) -> gtsam.Pose3:
-        return self.cTl if isinstance(self.cTl, gtsam.Pose3) else values.atPose3(self.cTl)
+        if isinstance(self.cTl, gtsam.Pose3):
+            return self.cTl
+        return _pose(values, self.cTl, "cTl")
 
     def offset(self, values: gtsam.Values) -> float:
-        return number(values, self.time_offset_s)
+        return number(values, self.time_offset_s, "time_offset_s")
 
     def bias(self, values: gtsam.Values, semantic_class: SemanticClass) -> float:
-        return number(values, self.biases_px.get(semantic_class, 0.0))
+        return number(values, self.biases_px.get(semantic_class, 0.0), "biases_px")
+
+    def check_kinds(self, values: gtsam.Values) -> None:
+        """Nothing, where extrinsic, offset and biases are among the values, of their kinds and finite.
+
+        Raises:
+            FactorError: one is not.
+        """
+        self.extrinsic(values)
+        self.offset(values)
+        for c in self.biases_px:
+            self.bias(values, c)
 
     @property
     def variables(self) -> tuple[int, ...]:
@@ -199,11 +261,34 @@ class AlignmentKeys:
         return True
 
 
-def number(values: gtsam.Values, key_or_value: int | float) -> float:
-    """A scalar variable, ``Vector(1)`` or ``double``, or the constant itself."""
+def number(values: gtsam.Values, key_or_value: int | float, argument: str) -> float:
+    """A scalar variable, ``Vector(1)`` or ``double``, or the constant itself.
+
+    Raises:
+        FactorError: no such variable, one of another kind, NaN or inf.
+    """
     if not isinstance(key_or_value, int):
         return key_or_value
-    try:
-        return float(values.atVector(key_or_value)[0])
-    except RuntimeError:
-        return float(values.atDouble(key_or_value))
+    value = _read(values, key_or_value, Vector(1), argument)
+    checked_finite(f"variable {key_name(key_or_value)} ({argument})", value)
+    return float(value[0])
+
+
+def body_pose(values: gtsam.Values, key: int) -> gtsam.Pose3:
+    """A pose wTb of the trajectory.
+
+    Raises:
+        FactorError: no such variable, one of another kind, NaN or inf.
+    """
+    return _pose(values, key, "pose of the trajectory")
+
+
+def _pose(values: gtsam.Values, key: int, argument: str) -> gtsam.Pose3:
+    pose: gtsam.Pose3 = _read(values, key, gtsam.Pose3, argument)
+    checked_gtsam(f"variable {key_name(key)} ({argument})", pose, gtsam.Pose3)
+    return pose
+
+
+def _read(values: gtsam.Values, key: int, kind: Kind, argument: str) -> Any:
+    checked_type("values", values, gtsam.Values, "a gtsam.Values")
+    return Reader(key, kind, "AlignmentKeys", argument).read(values)

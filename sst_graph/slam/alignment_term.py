@@ -23,7 +23,7 @@ from sst_graph.batch.by_edges.positions import position_columns
 from sst_graph.config import Settings, expect_settings, setting
 from sst_graph.drive.preparation import ImageFeatures, ScanFeatures
 from sst_graph.errors import DataError, count_of
-from sst_graph.factors.arguments import checked_type
+from sst_graph.factors.arguments import checked_array, checked_positive, checked_type
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.factors.camera_motion import Between
 from sst_graph.factors.pose_alignment import pose_alignment_factor
@@ -40,11 +40,14 @@ from sst_graph.slam.align import (
     align_frame,
     features_of,
 )
-from sst_graph.slam.alignment_keys import COLUMNS, POSITIONS, AlignmentKeys, bias_column
+from sst_graph.slam.alignment_keys import COLUMNS, POSITIONS, AlignmentKeys, bias_column, body_pose
 from sst_graph.slam.object_sides import ObjectSides
 from sst_graph.types import CameraImage, Scan, SemanticClass
 
 FloatArray = NDArray[np.float64]
+
+_LONGEST_S = 1e11
+"""Offsets beyond this lie outside of every trajectory, as the nanoseconds of 64 bits do [s]."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +98,7 @@ class TermPlace:
         return {self.between.X_a, self.between.X_b, self.between.X_s}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TermRows:
     """Matches of one term, linearized, over the columns :data:`~sst_graph.slam.alignment_keys.COLUMNS`.
 
@@ -127,7 +130,7 @@ class TermRows:
         return len(self.r)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TermMatches:
     """A term at some values: its factor, or why there is none.
 
@@ -187,14 +190,18 @@ class TermMatches:
         Args:
             values: where to linearize.
             covariance: (7, 7) of extrinsic and time offset; zeros for what is constant.
+
+        Raises:
+            FactorError: no such covariance, or no value for a key.
         """
+        C = checked_array("covariance of predicted_sigma_px", covariance, (7, 7))
         if self.term is None or not len(self):
             return 0.0
         J = np.concatenate([J for _, J in self.term.residuals_of(self, values)])
-        return float(np.sqrt(np.mean(np.einsum("ij,jk,ik->i", J, np.asarray(covariance), J))))
+        return float(np.sqrt(np.mean(np.einsum("ij,jk,ik->i", J, C, J))))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class AlignmentTerm:
     """One image and one scan, to be aligned in a graph of the user's own.
 
@@ -253,33 +260,45 @@ class AlignmentTerm:
         """The image's own stamp [ns]."""
         return self.image.stamp_ns
 
+    @property
+    def measured(self) -> set[tuple[int, int, SemanticClass]]:
+        """What it may count: stamps of image and scan [ns], and class."""
+        scans, classes = {each.stamp_ns for each in self.features}, self.config.classes
+        return {(self.stamp_ns, scan_ns, c) for scan_ns in scans for c in classes}
+
     def place(self, values: gtsam.Values) -> TermPlace | TermMatches:
-        """The poses between which the image was taken under the present offset, or why there are none."""
+        """The poses between which the image was taken under the present offset, or why there are none.
+
+        Raises:
+            FactorError: no value for a key, or one of another kind.
+        """
         trajectory = self.keys.trajectory
-        true_ns = self.stamp_ns + 1e9 * self.keys.offset(values)
+        # whole: a float of 64 bits has steps of 256 ns in our century
+        late_s = min(max(self.keys.offset(values), -_LONGEST_S), _LONGEST_S)
+        true_ns = self.stamp_ns + round(1e9 * late_s)
         outside_s = trajectory.outside_s(true_ns)
         a = trajectory.interval(true_ns)
         if a is None:
             after = outside_s > 0.0 or len(trajectory) < 2
             state = TermState.AFTER_TRAJECTORY if after else TermState.BEFORE_TRAJECTORY
             return TermMatches(state, 0.0, outside_s)
-        keys, stamps = trajectory.keys, trajectory.stamps_ns
         scan, of_scan = self._nearest_scan(true_ns, values)
         if of_scan is None:
             return TermMatches(TermState.NO_SCAN_POSE, 0.0)
-        poses = keys[a], keys[a + 1], keys[of_scan]
+        (X_a, stamp_a_ns), (X_b, stamp_b_ns) = trajectory.at(a), trajectory.at(a + 1)
+        poses = X_a, X_b, trajectory.at(of_scan)[0]
         if not all(values.exists(key) for key in poses):
             return TermMatches(TermState.POSE_MISSING, 0.0)
-        seconds, late_s = 1e-9 * (stamps[a + 1] - stamps[a]), 1e-9 * (self.stamp_ns - stamps[a])
-        between = Between(poses[0], poses[1], seconds, late_s, X_scan=poses[2], bTl=self.keys.bTl)
-        return TermPlace(between, stamps[a], a, scan)
+        seconds, after_a_s = 1e-9 * (stamp_b_ns - stamp_a_ns), 1e-9 * (self.stamp_ns - stamp_a_ns)
+        between = Between(X_a, X_b, seconds, after_a_s, X_scan=poses[2], bTl=self.keys.bTl)
+        return TermPlace(between, stamp_a_ns, a, scan)
 
-    def _nearest_scan(self, true_ns: float, values: gtsam.Values) -> tuple[int, int | None]:
+    def _nearest_scan(self, true_ns: int, values: gtsam.Values) -> tuple[int, int | None]:
         """Which scan is nearest in true time of those whose pose is known, and where in the trajectory."""
         trajectory, found = self.keys.trajectory, []
         for scan, features in enumerate(self.features):
             at = trajectory.position(features.stamp_ns)
-            if at is not None and values.exists(trajectory.keys[at]):
+            if at is not None and values.exists(trajectory.at(at)[0]):
                 found.append((abs(features.stamp_ns - true_ns), scan, at))
         return min(found)[1:] if found else (0, None)
 
@@ -290,7 +309,14 @@ class AlignmentTerm:
             values: with extrinsic, offset, biases and the poses around the image.
             kernel_px: scale of the robust kernel of contours [px]; ``GATE`` times it is the search range.
             information: what the image counts, over what its matches would by themselves.
+
+        Raises:
+            FactorError: no value for a key, one of another kind, or numbers that are not above 0.
         """
+        where = "AlignmentTerm.matched"
+        kernel_px = checked_positive(f"kernel_px of {where}", kernel_px)
+        information = checked_positive(f"information of {where}", information)
+        checked_type(f"values of {where}", values, gtsam.Values, "a gtsam.Values")
         place = self.place(values)
         if isinstance(place, TermMatches):
             return place
@@ -327,7 +353,7 @@ class AlignmentTerm:
         return TermRows.joined(parts)
 
     def _wTl(self, values: gtsam.Values, X: int) -> gtsam.Pose3:
-        wTb = values.atPose3(X)
+        wTb = body_pose(values, X)
         return wTb if self.keys.bTl is None else wTb * self.keys.bTl
 
     def _factor(self, place: TermPlace, found: FrameAlignments, information: float) -> gtsam.CustomFactor:
@@ -348,7 +374,7 @@ class AlignmentTerm:
             return []
         cTl, time_offset_s = self.keys.extrinsic(values), self.keys.offset(values)
         between = place.between
-        a, b = values.atPose3(between.X_a), values.atPose3(between.X_b)
+        a, b = body_pose(values, between.X_a), body_pose(values, between.X_b)
         c_twist = cTl.AdjointMap() @ self._in_lidar(
             np.asarray(gtsam.Pose3.Logmap(a.between(b))) / between.seconds
         )
@@ -392,6 +418,6 @@ class AlignmentTerm:
         between = place.between
         if between.X_s == between.X_a:
             return None
-        aTs = values.atPose3(between.X_a).between(values.atPose3(between.X_s))
+        aTs = body_pose(values, between.X_a).between(body_pose(values, between.X_s))
         bTl = self.keys.bTl
         return aTs if bTl is None else bTl.inverse() * aTs * bTl

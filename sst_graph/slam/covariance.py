@@ -45,6 +45,7 @@ from sst_graph.graph.linear import covariance_root
 from sst_graph.result import WeakDirection
 from sst_graph.slam.alignment_keys import COLUMNS, POSITIONS, AlignmentKeys, bias_column
 from sst_graph.slam.alignment_term import TermMatches, TermRows
+from sst_graph.slam.checked_terms import checked_terms, expect_factors_of
 from sst_graph.slam.config import RematchConfig
 from sst_graph.slam.object_sides import ObjectSides
 from sst_graph.slam.term_warnings import TermWarning, WarningKind, last_warnings
@@ -103,7 +104,8 @@ def calibration_covariance(
 
     Raises:
         EstimationError: no match has a factor, or the graph does not determine extrinsic and offset.
-        FactorError: no graph, no matches, or no value for a key.
+        FactorError: no graph, no matches, those of several cameras or one twice, a graph that does not hold
+            their factors once each, and no others of the kind, or no value for a key.
         ConfigError: no settings.
     """
     config = expect_settings(config, RematchConfig)
@@ -116,7 +118,10 @@ def calibration_covariance(
     used = [each for each in matches if each.factor is not None and each.term is not None]
     if not used or used[0].term is None:
         raise EstimationError("calibration_covariance: found no term with a factor, expected one or more")
+    checked_terms(where, [each.term for each in used])
     keys, sides = used[0].term.keys, ObjectSides()
+    expect_factors_of(where, graph, keys, [each.factor for each in used if each.factor is not None])
+    keys.check_kinds(values)
     P = marginal(graph, values, keys)
     if not np.isfinite(P).all():
         undetermined = "a graph that does not determine extrinsic and time offset"

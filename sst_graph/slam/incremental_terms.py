@@ -17,9 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.config import expect_settings
-from sst_graph.factors.arguments import checked_type
-from sst_graph.slam.alignment_keys import AlignmentKeys
+from sst_graph.errors import EstimationError
+from sst_graph.factors import FactorError
+from sst_graph.factors.arguments import checked_count, checked_number, checked_type
+from sst_graph.factors.custom.variables import checked_key, expect_kinds, key_name
+from sst_graph.slam.alignment_keys import COLUMNS, AlignmentKeys
 from sst_graph.slam.alignment_term import AlignmentTerm, TermMatches, TermState
+from sst_graph.slam.checked_terms import checked_terms, expect_factors_of
 from sst_graph.slam.config import CALM, RematchConfig
 from sst_graph.slam.covariance import (
     Robust,
@@ -33,8 +37,14 @@ from sst_graph.slam.covariance import (
     total,
 )
 from sst_graph.slam.object_sides import ObjectSides
-from sst_graph.slam.solving import checked_terms, moved_px, proximal, widest_px
-from sst_graph.slam.term_warnings import TermWarning, far_from_start, last_warnings, wide_uncertainty
+from sst_graph.slam.solving import moved_px, proximal, widest_px
+from sst_graph.slam.term_warnings import (
+    TermWarning,
+    far_from_start,
+    last_warnings,
+    uncertainty_px,
+    wide_uncertainty,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -101,6 +111,7 @@ class IncrementalTerms:
         self._sides = ObjectSides()
         self._gone = TermSums()
         self._start: tuple[gtsam.Values, FloatArray] | None = None
+        self._begun = False
 
     def update(
         self,
@@ -114,24 +125,42 @@ class IncrementalTerms:
         Args:
             graph, values: as the solver's own ``update`` takes them; the first hold extrinsic and offset.
             terms: new ones; a term whose image lies after the last pose waits for it.
-            stamps: for a smoother, stamp of each variable [s]; extrinsic and offset are stamped again here.
+            stamps: for a smoother, stamp of each variable [s], of each new pose of the trajectory at least;
+                extrinsic and offset are stamped again here.
 
         Raises:
-            FactorError: no graph, no values, no terms, no stamps.
+            FactorError: no graph, no values, no terms, no stamps; terms of another camera, or one that is
+                there already; a new variable that is there already, a factor on one that is not. Nothing has
+                been given to the solver then.
+            EstimationError: the solver does not determine extrinsic and offset.
         """
         where = "IncrementalTerms.update"
         checked_type(f"graph of {where}", graph, gtsam.NonlinearFactorGraph, "a NonlinearFactorGraph")
         checked_type(f"values of {where}", values, gtsam.Values, "a gtsam.Values")
-        checked_terms(where, terms)
-        checked_type(f"stamps of {where}", stamps, (Mapping, type(None)), "a dict from keys to seconds")
-        stamps = self._stamped(stamps)
+        checked_terms(where, terms, self._keys, [placed.term for placed in self._terms])
+        given = self._checked_stamps(where, stamps, values)
+        expect_factors_of(where, graph, self._keys, ())
+        self._check_variables(where, graph, values)
+        stamps = self._stamped(given)
+        self._begun = True
         self._solve(graph, values, stamps, self._leaving(stamps))
         self._terms += [_Placed(term) for term in terms]
         return self._rematch(_ROUNDS)
 
     def converge(self, most_rounds: int | None = None) -> IncrementalUpdate:
-        """Rounds of matching without anything new, until they change nothing."""
-        rounds = self._config.most_rounds if most_rounds is None else most_rounds
+        """Rounds of matching without anything new, until they change nothing.
+
+        Raises:
+            FactorError: no number of rounds.
+            EstimationError: there has been no update, or extrinsic and offset are not determined.
+        """
+        rounds = self._config.most_rounds
+        if most_rounds is not None:
+            rounds = checked_count("most_rounds of IncrementalTerms.converge", most_rounds)
+        if not self._begun:
+            raise EstimationError(
+                "IncrementalTerms.converge: found no update before it, expected one or more"
+            )
         return self._rematch(rounds)
 
     # --- rounds
@@ -178,9 +207,8 @@ class IncrementalTerms:
         """The next kernel; covariance (7, 7), robust at the last kernel, and whether all has converged."""
         config = self._config
         P, matches = self._marginal(), self._matches()
-        sigma_px = wide_uncertainty(matches, estimate, P[:7, :7], config, 0.0)
         widest = widest_px(matches, self._kernel_px)
-        known = bool(sigma_px) and sigma_px[0].value < max(_KNOWN * widest, _KNOWN_PX)
+        known = uncertainty_px(matches, estimate, P[:7, :7]) < max(_KNOWN * widest, _KNOWN_PX)
         calm = moved_px(matches, estimate) < CALM * widest
         if self._kernel_px > config.last_px:
             if calm and known:
@@ -297,14 +325,56 @@ class IncrementalTerms:
 
     def _marginal(self) -> FloatArray:
         """(n, n) by the solver, over the columns that all terms share."""
-        isam = self._solver if isinstance(self._solver, gtsam.ISAM2) else self._solver.getISAM2()
-        joint = isam.jointMarginalCovariance(list(self._keys.lasting))
+        if not self._keys.lasting:
+            return np.zeros((COLUMNS, COLUMNS))
+        try:
+            joint = self._isam().jointMarginalCovariance(list(self._keys.lasting))
+        except (RuntimeError, IndexError):  # indeterminate, or no factor in the solver touches them
+            found = "a solver that does not determine extrinsic and time offset"
+            raise EstimationError(f"IncrementalTerms: found {found}, expected priors on them") from None
         return self._keys.placed(np.asarray(joint.fullMatrix()))
 
-    def _stamped(self, stamps: Mapping[int, float] | None) -> dict[int, float]:
+    def _isam(self) -> gtsam.ISAM2:
+        return self._solver if isinstance(self._solver, gtsam.ISAM2) else self._solver.getISAM2()
+
+    # --- what is given
+
+    def _check_variables(self, where: str, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+        """What would leave the solver unusable, before it is given anything."""
+        isam, new = self._isam(), set(values.keys())
+        for key in sorted(new):
+            if isam.valueExists(key):
+                expected = "new variables only"
+                raise FactorError(f"values of {where}", f"{key_name(key)}, which is there already", expected)
+        factors = [graph.at(i) for i in range(graph.size()) if graph.exists(i)]
+        for key in sorted({*self._keys.lasting, *(int(key) for one in factors for key in list(one.keys()))}):
+            if key not in new and not isam.valueExists(key):
+                expected = "a value for each key of the graph, of extrinsic, offset and biases"
+                raise FactorError(f"values of {where}", f"no {key_name(key)}", expected)
+        every = gtsam.Values(isam.getLinearizationPoint())
+        every.insert(values)
+        self._keys.check_kinds(every)
+        expect_kinds(f"values of {where}", every, factors)
+
+    def _checked_stamps(
+        self, where: str, stamps: Mapping[int, float] | None, values: gtsam.Values
+    ) -> dict[int, float]:
+        """The stamps [s]; a smoother needs those of new poses, which it would keep for ever without."""
+        what = f"stamps of {where}"
+        checked_type(what, stamps, (Mapping, type(None)), "a dict from keys to seconds")
+        found = {
+            checked_key(where, "stamps", key): checked_number(what, seconds)
+            for key, seconds in (stamps or {}).items()
+        }
+        if not isinstance(self._solver, gtsam.ISAM2):
+            for key in list(values.keys()):
+                if key in self._keys.trajectory and key not in found:
+                    raise FactorError(what, f"none for {key_name(key)}", "one for each new pose")
+        return found
+
+    def _stamped(self, found: dict[int, float]) -> dict[int, float]:
         if isinstance(self._solver, gtsam.ISAM2):
             return {}
-        found = dict(stamps or {})
         if found:
             latest = max(found.values())
             found.update(dict.fromkeys(self._keys.lasting, latest))

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import gtsam
 import numpy as np
@@ -23,11 +22,11 @@ from numpy.typing import NDArray
 
 from sst_graph.config import expect_settings
 from sst_graph.errors import EstimationError, count_of
-from sst_graph.factors.arguments import checked_type
 from sst_graph.factors.custom.variables import checked_problem
 from sst_graph.factors.priors import time_offset_prior
 from sst_graph.slam.alignment_keys import AlignmentKeys
 from sst_graph.slam.alignment_term import AlignmentTerm, TermMatches
+from sst_graph.slam.checked_terms import checked_terms, expect_factors_of
 from sst_graph.slam.config import CALM, RematchConfig
 from sst_graph.slam.covariance import (
     TermSums,
@@ -81,17 +80,6 @@ class RematchSolution:
     warnings: tuple[TermWarning, ...]
 
 
-def checked_terms(where: str, terms: Any) -> None:
-    """Nothing, where they are terms.
-
-    Raises:
-        FactorError: they are not.
-    """
-    checked_type(f"terms of {where}", terms, (list, tuple), "a list of AlignmentTerm")
-    for term in terms:
-        checked_type(f"terms of {where}", term, AlignmentTerm, "an AlignmentTerm")
-
-
 def solve_with_terms(
     graph: gtsam.NonlinearFactorGraph,
     values: gtsam.Values,
@@ -101,14 +89,15 @@ def solve_with_terms(
     """Levenberg-Marquardt on a graph and the terms' factors, matched again until that changes nothing.
 
     Args:
-        graph: all other factors, priors on extrinsic and offset among them.
+        graph: all other factors, priors on extrinsic and offset among them; none of an earlier solution's.
         values: start, of all variables.
         terms: of one camera.
         config: the schedule.
 
     Raises:
         EstimationError: no term, no match at the start, or a system that is indeterminate at the end.
-        FactorError: no graph, no terms, or no value for a key of either.
+        FactorError: no graph, no terms, terms of several cameras, a term given twice, no value for a key of
+            either, or one of another kind.
         ConfigError: no settings.
     """
     config = expect_settings(config, RematchConfig)
@@ -118,6 +107,8 @@ def solve_with_terms(
     if not terms:
         raise EstimationError("solve_with_terms: found no term, expected one or more")
     keys, kernel_px, held = terms[0].keys, config.first_px, True
+    keys.check_kinds(values)
+    expect_factors_of("solve_with_terms", graph, keys, ())
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(_INNER_ITERATIONS)
     matches = match_all(terms, values, kernel_px, 1.0)

@@ -79,15 +79,24 @@ def wide_uncertainty(
         config: the schedule.
         reach_px: limit; by default the search range of the matches [px].
     """
-    found = [(each, each.term) for each in matches if each.factor is not None and each.term is not None]
+    found = [each for each in matches if each.factor is not None]
     if not found:
         return []
-    limit = GATE * max(each.scale_px for each, _ in found) if reach_px is None else reach_px
-    if not np.isfinite(covariance).all():
-        return [TermWarning(WarningKind.WIDE_UNCERTAINTY, float("inf"), limit, "px")]
-    sigmas = [each.predicted_sigma_px(values, covariance) for each, _ in found]
-    sigma_px = float(np.sqrt(np.mean(np.square(sigmas))))
+    limit = GATE * max(each.scale_px for each in found) if reach_px is None else reach_px
+    sigma_px = uncertainty_px(found, values, covariance)
     return [TermWarning(WarningKind.WIDE_UNCERTAINTY, sigma_px, limit, "px")] if sigma_px > limit else []
+
+
+def uncertainty_px(matches: Sequence[TermMatches], values: gtsam.Values, covariance: FloatArray) -> float:
+    """How far the calibration may err in the image, one sigma, RMS over the terms with a factor [px].
+
+    Args:
+        covariance: (7, 7) of extrinsic and offset; zeros for what is constant.
+    """
+    if not np.isfinite(covariance).all():
+        return float("inf")
+    sigmas = [each.predicted_sigma_px(values, covariance) for each in matches if each.factor is not None]
+    return float(np.sqrt(np.mean(np.square(sigmas)))) if sigmas else float("inf")
 
 
 def far_from_start(

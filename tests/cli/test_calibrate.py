@@ -156,6 +156,12 @@ def test_nothing_is_replaced_without_overwrite(
         (["--set", "metod=paper"], "unknown setting 'metod'; did you mean 'method'?"),
         (["--set", "method=magic"], "found 'magic', expected one of"),
         (["--config", "none.toml"], "none.toml: found no such file"),
+        (["--sweep-start-deg", "90"], "sweep start 90.0 deg: found sweep auto, expected clockwise"),
+        (["--sweep", "instant", "--sweep-stamp", "end"], "whose points are all at the stamp"),
+        (["--method", "edges", "--classes", "vehicle"], "--classes vehicle: means nothing for method edges"),
+        (["--set", "method=motion", "--classes", "all"], "means nothing for method motion"),
+        (["--method", "motion", "--estimate", "focal"], "needs method joint, edges or both, found motion"),
+        (["--method", "paper", "--estimate", "k1=0.05,cy"], "assumptions.estimate=k1=0.05,cy needs"),
     ],
 )
 def test_bad_options(
@@ -166,6 +172,19 @@ def test_bad_options(
     assert captured.out == "" and captured.err.count("\n") == 1
     assert message in captured.err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_classes_of_a_drive_without_labels_are_reported(
+    street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bare = tmp_path / "drive/sequences/00"
+    bare.mkdir(parents=True)
+    for entry in (street / "sequences/00").iterdir():
+        if entry.name not in ("labels", "semantic_2"):
+            (bare / entry.name).symlink_to(entry)
+    options = ["--classes", "vehicle", "--init", "none", "--frames", "0:2", "--no-report"]
+    assert _calibrate(tmp_path / "drive", tmp_path / "result", *options) == 3
+    assert "note: --classes vehicle: without labels method edges is used" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

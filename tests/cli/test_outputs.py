@@ -97,6 +97,33 @@ def test_other_pairs_are_refused_and_other_measurements_reported(
     assert "was made with --sweep auto, found --sweep instant" in capsys.readouterr().err
 
 
+def test_a_turn_is_read_as_the_calibration_read_it(
+    street: Path, shifted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With start and stamp of the turn; another sweep is read without them."""
+    document = json.loads((shifted / "calibration.json").read_text())
+    document["read_as"] |= {"sweep": "clockwise", "sweep_start_deg": 90.0, "sweep_stamp": "end"}
+    turned_result = tmp_path / "calibration.json"
+    turned_result.write_text(json.dumps(document))
+
+    def shown(name: str, *options: str) -> bytes:
+        out = tmp_path / f"{name}.png"
+        assert (
+            main(["overlay", str(turned_result), str(street), "--frame", "1", "--out", str(out), *options])
+            == 0
+        )
+        return out.read_bytes()
+
+    kept = shown("kept")
+    notes = capsys.readouterr().err
+    assert "read with --sweep-start-deg 90.0" in notes and "read with --sweep-stamp end" in notes
+    turn = ["--sweep", "clockwise", "--sweep-start-deg", "90", "--sweep-stamp", "end"]
+    assert kept == shown("said", *turn) != shown("from behind", "--sweep", "counterclockwise")
+    capsys.readouterr()
+    shown("compensated", "--sweep", "compensated")
+    assert "sweep-start" not in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("name", "value", "expected"),
     [
@@ -245,6 +272,14 @@ def test_a_place_where_nothing_can_be_made(
     assert out in _refused(capsys, "calibrate", street, "--out", out)
     assert out in _refused(capsys, "export", street, "--to", "kitti", "--out", out)
     assert out in _refused(capsys, "experiment", "windows", "--out", out)
+
+
+@pytest.mark.parametrize(("name", "option"), [("fit", "--data"), ("fit", "--methods"), ("rigs", "--jobs")])
+def test_an_option_of_another_experiment_is_named(
+    capsys: pytest.CaptureFixture[str], name: str, option: str
+) -> None:
+    said = _refused(capsys, "experiment", name, option, "1")
+    assert f"{option}: means nothing for experiment {name}" in said
 
 
 @pytest.mark.parametrize("frames", ["0", "-1", "100001", str(10**18), str(10**400)])

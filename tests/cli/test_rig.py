@@ -99,6 +99,8 @@ def test_as_json_with_videos_inside(street: Path, tmp_path: Path, capsys: pytest
     [
         (["--camera", "image_2", "image_7"], "camera 'image_7': "),
         (["--camera", "image_2", "image_7"], "has image_2, image_3"),
+        (["--camera", "image_2", "--camera", "image_7"], "camera 'image_7': "),
+        (["--camera", "image_2", "--camera", "image_3", "--rig-sigma", "1,1"], "expected with --rig"),
         (["--camera", "image_2", "image_2"], "--camera image_2: found twice"),
         (["--camera", "image_2", "--rig", "dataset"], "--rig: means something for several cameras only"),
         (["--one-trigger"], "--one-trigger: means something for several cameras only"),

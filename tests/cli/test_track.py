@@ -180,6 +180,8 @@ def test_resumed_without_options_or_with_the_same(
     ("options", "message"),
     [
         (["--resume"], "--resume needs --checkpoint"),
+        (["--checkpoint-every", "3"], "--checkpoint-every needs --checkpoint"),
+        (["--method", "edges", "--classes", "vehicle"], "--classes vehicle: means nothing for method edges"),
         (["--checkpoint", "x.npz", "--checkpoint-every", "0"], "expected 1 or more"),
         (["--set", "windw=3"], "unknown setting 'windw'; did you mean 'window'?"),
         (["--set", "drift.rotation_deg=-1"], "rotation_deg"),

@@ -103,6 +103,7 @@ BAD = [
     (text("times.txt", "0\n0.1\n0.1\n0.3\n0.4\n"), r"times\.txt: found equal stamps 1 and 2"),
     (text("times.txt", "0\n0.1\n0.2\n0.15\n0.4\n"), r"times\.txt: found falling stamps 2 and 3"),
     (edited("calib.txt", "P2", "Q2"), r"calib\.txt: found no line P2"),
+    (edited("calib.txt", "P2: ", "P2: 1 0 0 0 0 1 0 0 0 0 1 0\nP2: "), "found another P2 than above"),
     (cut(SCAN, 100), r"000002\.bin: found 100 bytes, expected a multiple of 16"),
     (cut(SCAN, 96), r"000002\.label: found 12 labels, expected 6"),
     (cut("labels/000002.label", 46), r"000002\.label: found 46 bytes, expected a multiple of 4"),

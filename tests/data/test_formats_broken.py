@@ -120,6 +120,16 @@ BROKEN: list[tuple[str, Change, str]] = [
     ("folder", edit("camera.yaml", "fx: 700.0", "fx: .nan"), r"\(fx\): found nan"),
     ("folder", edit("camera.yaml", "fx: 700.0", "fx: [700"), "no YAML"),
     ("folder", edit("camera.yaml", "height: 6\n", ""), "no height"),
+    ("folder", edit("camera.yaml", "height: 6\n", "height: 6\nfx: 9\n"), "'fx' twice in one table"),
+    ("raw", edit("../calib_velo_to_cam.txt", "T: ", "T: 1 2 3\nT: "), "found another T than above"),
+    (
+        "folder",
+        write(
+            "extrinsic.yaml", f"T_camera_lidar: {[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0]}\ntranslation: [0]\n"
+        ),
+        "found two poses",
+    ),
+    ("folder", write("extrinsic.yaml", "T_lidar_camera: [1]\n"), "expected T_camera_lidar, or translation"),
     ("folder", edit("camera.yaml", "fx: 700.0", "a: &a 1\nfx: *a"), "an alias"),
     ("folder", write("camera.yaml", "- 1\n"), "a YAML list"),
     ("folder", write("camera.yaml", "a: !!python/object:os.system {}\n"), "no YAML"),

@@ -232,6 +232,7 @@ FITS: dict[str, set[str]] = {
     "coefficients": {"array", "list", "empty"},
     "factor": {"factor"},
     "function": {"function", "class"},
+    "custom_factor.function": {"class"},
     "graph": {"graph"},
     "groups": {"array", "empty"},
     "known_inliers": {"empty"},

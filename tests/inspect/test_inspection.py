@@ -178,6 +178,15 @@ def test_the_text_without_frames_says_so() -> None:
     assert "reason       it moved on" in text and "b/00: -20.00 ms, sigma 2.0 ms" in text
 
 
+def test_the_text_of_a_result_that_used_no_frame() -> None:
+    """Sigmas of priors alone, no weak direction named: neither within the limits, nor another method's."""
+    result = replace(result_of(100.0 * np.diag(SIGMAS**2)), frames_used=(), status="unobservable")
+    text = inspection_text(inspect_result(result))
+    assert "weak directions: none named by this result, whose sigmas are past the limits" in text
+    assert "none past the limits" not in text and "--method joint only" not in text
+    assert "method joint: no frame was used" in text
+
+
 def test_many_frames_are_cut_unless_asked_for() -> None:
     frames = [frame(k, [1.02] * 7, 3.0) for k in range(30)]
     inspection = inspect_result(result_of(np.diag(SIGMAS**2), frames))

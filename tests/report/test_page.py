@@ -29,7 +29,7 @@ from sst_graph.report import ReportInputs, report_html
 from sst_graph.report.close_ups import COUNT, ZOOM, telling_detections
 from sst_graph.report.drawn_frame import DriveReader
 from sst_graph.report.overlay import project_points
-from sst_graph.result import CalibrationResult
+from sst_graph.result import CalibrationResult, WeakDirection
 from sst_graph.types import Calibration, Source
 
 CHROMIUM = next(
@@ -232,6 +232,24 @@ def test_names_of_the_data_are_text() -> None:
         and "alert(1)</script>" not in page
         and "<b>" not in page
         and "<i>" not in page
+    )
+
+
+def test_a_reason_is_listed_once() -> None:
+    """A weak direction that a reason names is not repeated behind the reasons."""
+    named, other = (
+        WeakDirection(np.eye(7)[k], 1.0, f"the {what} is hardly known", f"record {what}")
+        for k, what in enumerate(("roll", "pitch"))
+    )
+    reasons = ("the roll is hardly known: record roll",)
+    weak = replace(
+        _result(), fit=None, status="unobservable", reasons=reasons, weak_directions=(named, other)
+    )
+    page = report_html(ReportInputs(weak, [crowded_street()]))
+    full = page[page.index("The reasons in full") :]
+    full = full[: full.index("</details>")]
+    assert (
+        full.count("the roll is hardly known") == full.count("the pitch is hardly known: record pitch") == 1
     )
 
 

@@ -3,6 +3,7 @@ at one speed."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import gtsam
@@ -14,8 +15,9 @@ from sst_graph import AlignmentKeys, Trajectory, calibration_covariance, solve_w
 from sst_graph.association.edge_matching import SIDES
 from sst_graph.covariance.error_model import ErrorModel
 from sst_graph.errors import EstimationError
+from sst_graph.factors import FactorError
 from sst_graph.slam.alignment_keys import COLUMNS, bias_column
-from sst_graph.slam.alignment_term import TermRows
+from sst_graph.slam.alignment_term import TermMatches, TermRows
 from sst_graph.slam.config import RematchConfig
 from sst_graph.slam.covariance import (
     MASK_BIAS_PRIOR_PX,
@@ -220,8 +222,35 @@ def test_matches_that_count_in_full_are_too_sure(steady: Street, solution: Remat
     assert scaled.times_too_sure < 0.8 * by_hand.times_too_sure
 
 
+def _graph_of(matches: Sequence[TermMatches]) -> gtsam.NonlinearFactorGraph:
+    """The factors of matches alone."""
+    graph = gtsam.NonlinearFactorGraph()
+    for each in matches:
+        if each.factor is not None:
+            graph.add(each.factor)
+    return graph
+
+
+def test_refuses_a_graph_that_does_not_hold_just_the_factors_of_the_matches(
+    solution: RematchSolution,
+) -> None:
+    graph, values, matches = solution.graph, solution.values, solution.matches
+    whole = calibration_covariance(graph, values, matches)
+    assert np.isfinite(whole.covariance).all()
+    with pytest.raises(FactorError, match="factors missing"):
+        calibration_covariance(gtsam.NonlinearFactorGraph(), values, matches)
+    with pytest.raises(FactorError, match="further alignment factor"):
+        calibration_covariance(graph, values, matches[2:])
+    twice = gtsam.NonlinearFactorGraph(graph)
+    twice.push_back(_graph_of(matches))
+    with pytest.raises(FactorError, match="a factor twice"):
+        calibration_covariance(twice, values, matches)
+    with pytest.raises(FactorError, match="each pair once"):
+        calibration_covariance(graph, values, [*matches, matches[0]])
+
+
 def test_refuses_what_tells_nothing(steady: Street, solution: RematchSolution) -> None:
     with pytest.raises(EstimationError, match="no term with a factor"):
         calibration_covariance(solution.graph, solution.values, [])
     with pytest.raises(EstimationError, match="expected priors"):
-        calibration_covariance(gtsam.NonlinearFactorGraph(), solution.values, solution.matches)
+        calibration_covariance(_graph_of(solution.matches), solution.values, solution.matches)

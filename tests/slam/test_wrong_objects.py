@@ -37,6 +37,8 @@ FITS: dict[str, set[str]] = {
     "l_velocities": {"dict"},
     "lTs": {"Pose3"},
     "from_ns": {"int", "negative"},
+    "kernel_px": {"int", "float"},
+    "information": {"int", "float"},
     "AlignmentTerm.camera": set(),
     "AlignmentTerm.l_velocities": {"empty"},
     "CameraCalibration.cTl": {"Pose3"},
@@ -55,7 +57,8 @@ def right() -> dict[str, tuple[Callable[..., Any], dict[str, Any]]]:
     terms = [street.term(2, keys)]
     matches = [terms[0].matched(values, 40.0)]
     assert matches[0].factor is not None
-    graph.add(matches[0].factor)
+    matched = gtsam.NonlinearFactorGraph(graph)
+    matched.add(matches[0].factor)
     calibration = CameraCalibration(street.camera, street.cTl, 0.1)
     motion = ScanMotion(np.zeros(6), lTs=POSE, from_ns=0)
     marginal = CalibrationMarginal(POSE, 0.1, np.eye(7), np.zeros(7))
@@ -78,7 +81,20 @@ def right() -> dict[str, tuple[Callable[..., Any], dict[str, Any]]]:
             {"solver": gtsam.ISAM2(), "keys": keys, "config": RematchConfig()},
         ),
         "solve_with_terms": (sst_graph.solve_with_terms, {"terms": terms, **solved}),
-        "calibration_covariance": (sst_graph.calibration_covariance, {"matches": matches, **solved}),
+        "calibration_covariance": (
+            sst_graph.calibration_covariance,
+            {"matches": matches, **solved, "graph": matched},
+        ),
+        "AlignmentTerm.matched": (
+            terms[0].matched,
+            {"values": values, "kernel_px": 40.0, "information": 0.5},
+        ),
+        "AlignmentTerm.place": (terms[0].place, {"values": values}),
+        "TermMatches.moved_px": (matches[0].moved_px, {"values": values}),
+        "TermMatches.predicted_sigma_px": (
+            matches[0].predicted_sigma_px,
+            {"values": values, "covariance": np.eye(7)},
+        ),
         "CameraCalibration": (
             CameraCalibration,
             {"camera": street.camera, "cTl": POSE, "time_offset_s": 0.1, "biases_px": {}},

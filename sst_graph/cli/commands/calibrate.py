@@ -13,7 +13,7 @@ from sst_graph.batch import CalibrationConfig, calibrate
 from sst_graph.batch.by_edges.choice import with_method_for
 from sst_graph.cli.inputs import calibration_settings, open_drives, starting_point
 from sst_graph.cli.labels import check_classes
-from sst_graph.cli.messages import mention, say
+from sst_graph.cli.messages import complain, mention, say
 from sst_graph.cli.outputs import (
     CALIBRATION,
     check_apart,
@@ -54,6 +54,10 @@ def run(args: argparse.Namespace) -> int:
             config = dataclasses.replace(with_method_for(config, sources), for_report=not args.no_report)
             if config.method not in ("motion", "edges"):
                 check_classes(sources, config.classes, args.classes)
+            elif args.classes is not None:
+                complain(
+                    f"note: --classes {args.classes}: without labels method edges is used, which aligns none"
+                )
             warn_of_other_pairs(args.init, read_as)
             initial, time_offset_s = starting_point(args.init, sources[0], args.camera)
             result, against = calibrate_drives(sources, initial, time_offset_s, config, args.camera)

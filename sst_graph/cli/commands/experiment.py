@@ -13,6 +13,7 @@ from sst_graph.cli.inputs import settings
 from sst_graph.cli.messages import mention, say
 from sst_graph.cli.outputs import check_apart
 from sst_graph.cli.progress import ProgressBar
+from sst_graph.errors import ConfigError
 from sst_graph.experiments.paper.config import PaperTableConfig
 from sst_graph.experiments.paper.tables import STATE, PaperTable
 from sst_graph.experiments.registry import experiment
@@ -28,7 +29,11 @@ def run(args: argparse.Namespace) -> int:
     chosen = experiment(args.name)
     methods = None if args.methods is None else [m.strip() for m in args.methods.split(",") if m.strip()]
     flags = {"data": args.data, "streets": args.streets, "seed": args.seed, "methods": methods}
-    config = settings(chosen.config, args, flags | {"jobs": args.jobs})
+    flags["jobs"] = args.jobs
+    for name, value in flags.items():
+        if value is not None and not hasattr(chosen.config, name):
+            raise ConfigError(f"--{name}: means nothing for experiment {args.name}")
+    config = settings(chosen.config, args, flags)
     if chosen.table is not None and args.out is not None:
         return _write_table(chosen.table, config, args)
     check_apart({"--config": args.config}, {"--out": args.out})

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from sst_graph.batch.by_edges.choice import with_method_for
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.cli import EXIT_NOT_TRUSTED
-from sst_graph.cli.inputs import chosen_classes, settings, starting_point
+from sst_graph.cli.inputs import chosen_classes, refuse_unused_classes, settings, starting_point
 from sst_graph.cli.labels import check_classes
 from sst_graph.cli.messages import complain, say
 from sst_graph.cli.outputs import CHECKPOINT_FILE, RERUN_FILE, RESULT_FILE, check_apart
@@ -30,6 +30,8 @@ from sst_graph.tracker.storage.resume import Setup, frames_to_come
 from sst_graph.tracker.track_update import TrackUpdate
 from sst_graph.tracker.tracker import Tracker
 from sst_graph.types import Frame, Source
+
+_FRAMES_BETWEEN_SAVES = 50
 
 if TYPE_CHECKING:
     from sst_graph.viewer import TrackerView
@@ -139,6 +141,10 @@ def _check(args: argparse.Namespace) -> None:
         rerun()
     if args.resume and args.checkpoint is None:
         raise ConfigError("--resume needs --checkpoint FILE")
+    if args.checkpoint_every is not None and args.checkpoint is None:
+        raise ConfigError("--checkpoint-every needs --checkpoint FILE")
+    if args.checkpoint_every is None:
+        args.checkpoint_every = _FRAMES_BETWEEN_SAVES
     if args.checkpoint_every < 1:
         raise ConfigError(f"--checkpoint-every {args.checkpoint_every}: expected 1 or more")
     if args.checkpoint is not None and args.checkpoint.exists() and not (args.resume or args.overwrite):
@@ -161,6 +167,7 @@ def _begun(args: argparse.Namespace, source: Source) -> tuple[Tracker, SweptSour
         "calibration.assumptions.estimate": None if args.estimate is None else args.estimate.split(","),
     }
     config = settings(TrackerConfig(), args, flags)
+    refuse_unused_classes(args.classes, config.calibration.method)
     check_classes([source], config.calibration.classes, args.classes)
     if args.init is not None:
         warn_of_other_pairs(args.init, options_of(args))

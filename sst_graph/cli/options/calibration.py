@@ -144,9 +144,7 @@ def add_track(commands: Commands) -> argparse.ArgumentParser:
     add_estimate(track)
     add_settings(track)
     track.add_argument("--checkpoint", type=Path, metavar="FILE", help="save the tracker here as it goes")
-    track.add_argument(
-        "--checkpoint-every", type=int, default=50, metavar="N", help="frames between saves (default 50)"
-    )
+    track.add_argument("--checkpoint-every", type=int, metavar="N", help="frames between saves (default 50)")
     track.add_argument(
         "--resume",
         action="store_true",

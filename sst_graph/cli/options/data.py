@@ -39,7 +39,9 @@ def add_source_options(command: argparse.ArgumentParser, several_cameras: bool =
     source.add_argument("--frames", metavar="A:B", help="frames A to B-1 only")
     named = f"camera folder, nuScenes channel or image topic (default {SOURCE_DEFAULTS['camera']})"
     if several_cameras:
-        source.add_argument("--camera", nargs="+", metavar="NAME", help=f"{named}; several: a rig")
+        source.add_argument(
+            "--camera", nargs="+", action="extend", metavar="NAME", help=f"{named}; several: a rig"
+        )
     else:
         source.add_argument("--camera", metavar="NAME", help=named)
     source.add_argument("--cloud", help=f"folder of the scans (default {SOURCE_DEFAULTS['cloud']})")

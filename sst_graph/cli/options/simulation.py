@@ -61,6 +61,7 @@ def add_experiment(commands: Commands) -> argparse.ArgumentParser:
     experiment.add_argument(
         "--data",
         nargs="+",
+        action="extend",
         metavar="DIR",
         help="real drives with a reference calibration, or a KITTI odometry root, of which table1 to table4 "
         "take sequence 00 (default: simulated streets)",

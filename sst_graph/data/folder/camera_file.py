@@ -62,6 +62,8 @@ def read_extrinsic(path: Path) -> gtsam.Pose3:
         MissingDependencyError: PyYAML is not installed.
     """
     table = read_yaml(path)
+    if "T_camera_lidar" in table and ("translation" in table or "quaternion" in table):
+        raise DataError(path, "two poses, T_camera_lidar and translation or quaternion", "one of them")
     if "T_camera_lidar" in table:
         place = f"{path} (T_camera_lidar)"
         return checked_pose(np.array(numbers(table["T_camera_lidar"], place, 16)).reshape(4, 4), place)
@@ -76,11 +78,13 @@ def read_extrinsic(path: Path) -> gtsam.Pose3:
     return checked_pose(matrix, str(path))
 
 
+_POSE = "T_camera_lidar, or translation and quaternion"
+
+
 def _entry(table: Mapping[Any, Any], name: str, path: Path) -> Any:
     if name not in table:
-        raise DataError(
-            path, f"no {name}", _EXPECTED if name != "quaternion" else "translation and quaternion"
-        )
+        expected = _POSE if name in ("translation", "quaternion") else _EXPECTED
+        raise DataError(path, f"no {name}", expected)
     return table[name]
 
 

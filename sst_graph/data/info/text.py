@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from sst_graph.data.info.summary import DriveInfo, ImageInfo, ScanInfo, SensorInfo
 from sst_graph.errors import count_of
@@ -59,14 +59,18 @@ def _masks(images: ImageInfo) -> str:
     if not images.masks:
         return "no masks"
     share, pixels = _share(images.masks), _share(images.labelled_pixels)
-    return f"masks of {share} of the images, {pixels} of all pixels: {', '.join(images.classes)}"
+    return f"masks of {share} of the images, {pixels} of all pixels: {_classes(images.classes)}"
 
 
 def _points(scans: ScanInfo) -> str:
     if not scans.labelled_scans:
         return "no labels of points"
     share, points = _share(scans.labelled_scans), _share(scans.labelled_points)
-    return f"labels in {share} of the scans, {points} of all points: {', '.join(scans.classes)}"
+    return f"labels in {share} of the scans, {points} of all points: {_classes(scans.classes)}"
+
+
+def _classes(names: Sequence[str]) -> str:
+    return ", ".join(names) or "none that can be aligned"
 
 
 def _share(share: float) -> str:

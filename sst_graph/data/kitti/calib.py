@@ -115,14 +115,18 @@ def read_calibration(path: Path) -> KittiCalibration:
 
     Raises:
         DataError: a missing file, a line with the wrong number of values or a value that is no
-            finite number, or a Tr whose rotation is none.
+            finite number, two lines of one name that differ, or a Tr whose rotation is none.
     """
     text = read_text(path, CALIB_TXT)
     matrices: dict[str, FloatArray] = {}
     for number, line in enumerate(text.splitlines(), 1):
         name, colon, values = line.partition(":")
-        if colon and re.fullmatch(r"P\d|Tr", name.strip()):
-            matrices[name.strip()] = _matrix(values.split(), name.strip(), f"{path}:{number}")
+        name = name.strip()
+        if not colon or not re.fullmatch(r"P\d|Tr", name):
+            continue
+        matrix = _matrix(values.split(), name, f"{path}:{number}")
+        if not np.array_equal(matrices.setdefault(name, matrix), matrix):
+            raise DataError(f"{path}:{number}", f"another {name} than above", f"one line {name}")
     projections = {int(name[1:]): matrix for name, matrix in matrices.items() if name != "Tr"}
     c0Tl = pose_from(matrices["Tr"], f"{path} (Tr)") if "Tr" in matrices else None
     return KittiCalibration(path, projections, c0Tl)

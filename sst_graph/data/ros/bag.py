@@ -192,6 +192,20 @@ class Bag:
         Raises:
             DataError: the message is shorter than that.
         """
+        seconds, nanoseconds, length = self._header(data)
+        frame = data[16 : 16 + length].decode("utf-8", "backslashreplace")
+        return seconds * 1_000_000_000 + nanoseconds, frame.lstrip("/")
+
+    def without_header(self, data: bytes) -> bytes:
+        """What follows on the std_msgs/Header that a message begins with.
+
+        Raises:
+            DataError: the message is shorter than that.
+        """
+        return data[16 + self._header(data)[2] :]
+
+    def _header(self, data: bytes) -> tuple[int, int, int]:
+        """Seconds, nanoseconds and length of the frame's name."""
         try:
             if self.is_ros1:
                 _, seconds, nanoseconds, length = struct.unpack_from("<IIII", data, 0)
@@ -203,8 +217,7 @@ class Bag:
             raise DataError(
                 self.path, f"a message of {count_of(len(data), 'byte')}", "a std_msgs/Header"
             ) from None
-        frame = data[16 : 16 + length].decode("utf-8", "backslashreplace")
-        return seconds * 1_000_000_000 + nanoseconds, frame.lstrip("/")
+        return seconds, nanoseconds, length
 
     def decoded(self, data: bytes, type_name: str) -> Any:
         """A message with its fields as attributes.

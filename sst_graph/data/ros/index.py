@@ -33,7 +33,8 @@ class BagIndex:
     Attributes:
         images, clouds, masks: of the camera and the LiDAR, stamps rising.
         image_frame, cloud_frame: names of their coordinate frames.
-        info: the first CameraInfo.
+        info: the first CameraInfo of a calibrated camera; the first where there is none.
+        other_infos: how many CameraInfo describe another camera than it.
         transforms: of all TFMessages.
         repeated: messages left out because their stamp is that of another of the same topic.
         received_ns: (n,) times of all messages of the sensors, rising.
@@ -45,6 +46,7 @@ class BagIndex:
     image_frame: str
     cloud_frame: str
     info: Any
+    other_infos: int
     transforms: Transforms
     repeated: int
     received_ns: NDArray[np.int64]
@@ -64,7 +66,7 @@ def read_index(bag: Bag, topics: Topics, stamps: Stamps) -> BagIndex:
     """
     sensors = {name: _Sensor() for name in topics.sensors}
     received: list[int] = []
-    info, transforms = None, Transforms()
+    models, transforms = _CameraInfos(), Transforms()
     types = bag.topics
     for message, data in bag.messages([*topics.sensors, topics.info.name, *topics.transforms]):
         if message.topic in sensors:
@@ -76,8 +78,8 @@ def read_index(bag: Bag, topics: Topics, stamps: Stamps) -> BagIndex:
             received.append(message.received_ns)
         elif message.topic in topics.transforms:
             transforms.add(bag.decoded(data, types[message.topic].type))
-        elif info is None:
-            info = bag.decoded(data, topics.info.type)
+        else:
+            models.add(bag, data, topics.info.type)
     rising = {name: _rising(bag, name, sensor.stamped) for name, sensor in sensors.items()}
     masks = () if topics.mask is None else rising[topics.mask.name]
     return BagIndex(
@@ -86,11 +88,33 @@ def read_index(bag: Bag, topics: Topics, stamps: Stamps) -> BagIndex:
         masks=masks,
         image_frame=sensors[topics.image.name].frame,
         cloud_frame=sensors[topics.cloud.name].frame,
-        info=info,
+        info=models.first,
+        other_infos=models.others,
         transforms=transforms,
         repeated=sum(len(sensors[name].stamped) - len(rising[name]) for name in sensors),
         received_ns=np.sort(np.array(received, np.int64)),
     )
+
+
+@dataclass
+class _CameraInfos:
+    """The CameraInfo messages of a bag, of which equal ones are decoded once."""
+
+    first: Any = None
+    others: int = 0
+    _bytes: bytes = b""
+
+    def add(self, bag: Bag, data: bytes, type_name: str) -> None:
+        """Take a message."""
+        content = bag.without_header(data)
+        if self.first is None or not _is_calibrated(self.first):
+            self.first, self._bytes, self.others = bag.decoded(data, type_name), content, 0
+        elif content != self._bytes:
+            self.others += _is_calibrated(bag.decoded(data, type_name))
+
+
+def _is_calibrated(info: Any) -> bool:
+    return bool(np.any(getattr(info, "k", getattr(info, "K", ()))))
 
 
 def _rising(bag: Bag, topic: str, stamped: list[Stamped]) -> tuple[Stamped, ...]:

@@ -129,6 +129,10 @@ def open_ros(path: Path, options: SourceOptions) -> Source:
     notes = [f"camera model from {topics.info.name}"]
     if index.repeated:
         notes.append(f"left out {count_of(index.repeated, 'message')} with the stamp of another")
+    if index.other_infos:
+        others = count_of(index.other_infos, "CameraInfo", "CameraInfo")
+        notes.append(f"{others} of {topics.info.name} of another camera than the first, whose model is taken")
+        _LOG.warning("%s: %s", printable(path), notes[-1])
     model, name = geometry.model, printable(path.stem if path.is_file() else path.name)
     properties = DriveProperties(name, model.intrinsics, nominal, nominal_reason=reason, notes=tuple(notes))
     scans = Sensor(_stamps(index.clouds), messages.scan, _place_of(topics.cloud), topics.cloud.name)

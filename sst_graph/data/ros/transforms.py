@@ -7,7 +7,10 @@ from itertools import pairwise
 from typing import Any
 
 import gtsam
+import numpy as np
 
+_ROUNDED = 2e-2
+"""Most that the length of a quaternion may be off 1, as in one that was typed by hand (0.7 0 0 0.7)."""
 _SAME = 1e-6
 """Transforms that differ by less [m, and in the elements of the rotation] are the same."""
 
@@ -18,11 +21,15 @@ class Transforms:
     def __init__(self) -> None:
         self._poses: dict[tuple[str, str], gtsam.Pose3] = {}
         self._moving: set[tuple[str, str]] = set()
+        self._wrong: dict[tuple[str, str], str] = {}
 
     def add(self, message: Any) -> None:
         """Take the transforms of a TFMessage."""
         for one in message.transforms:
-            self.add_pose(one.header.frame_id, one.child_frame_id, _pose(one.transform))
+            pose, wrong = _pose(one.transform)
+            self.add_pose(one.header.frame_id, one.child_frame_id, pose)
+            if wrong:
+                self._wrong[_frame(one.header.frame_id), _frame(one.child_frame_id)] = wrong
 
     def add_pose(self, parent: str, child: str, pose: gtsam.Pose3) -> None:
         """Take the pose of ``child`` in ``parent``."""
@@ -38,6 +45,7 @@ class Transforms:
             for (parent, child), pose in one._poses.items():
                 both.add_pose(parent, child, pose)
             both._moving |= one._moving
+            both._wrong |= one._wrong
         return both
 
     @property
@@ -58,7 +66,7 @@ class Transforms:
         return frame
 
     def pose(self, parent: str, child: str) -> tuple[gtsam.Pose3 | None, str]:
-        """Pose of ``child`` in ``parent``, or None, and why: missing, moving or ambiguous."""
+        """Pose of ``child`` in ``parent``, or None, and why: missing, moving, ambiguous or none."""
         if parent == child:
             return None, f"camera and LiDAR have the same frame, {parent!r}"
         path = self._path(parent, child)
@@ -67,6 +75,8 @@ class Transforms:
         pose = gtsam.Pose3()
         for first, second in pairwise(path):
             edge = (first, second) if (first, second) in self._poses else (second, first)
+            if wrong := self._wrong.get(edge):
+                return None, f"the transform from {edge[0]!r} to {edge[1]!r} has {wrong}"
             if edge in self._moving:
                 return None, f"the transform from {edge[0]!r} to {edge[1]!r} is not constant"
             parents = self.parents(edge[1])
@@ -102,6 +112,17 @@ def _frame(name: str) -> str:
     return str(name).lstrip("/")
 
 
-def _pose(transform: Any) -> gtsam.Pose3:
+def _pose(transform: Any) -> tuple[gtsam.Pose3, str]:
+    """The pose, and what is wrong with it; '' where nothing is.
+
+    A message that was never filled in has a quaternion of length 0, and gtsam makes no rotation of one whose
+    length is not 1.
+    """
     q, t = transform.rotation, transform.translation
-    return gtsam.Pose3(gtsam.Rot3.Quaternion(q.w, q.x, q.y, q.z), [t.x, t.y, t.z])
+    wxyz, xyz = np.array([q.w, q.x, q.y, q.z]), np.array([t.x, t.y, t.z])
+    length = float(np.linalg.norm(wxyz))
+    if not abs(length - 1.0) <= _ROUNDED:
+        return gtsam.Pose3(), f"a quaternion of length {length:.4g}, not 1"
+    if not np.isfinite(xyz).all():
+        return gtsam.Pose3(), "a translation that is not finite"
+    return gtsam.Pose3(gtsam.Rot3.Quaternion(*(wxyz / length)), xyz), ""

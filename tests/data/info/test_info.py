@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -66,3 +67,11 @@ def test_a_drive_without_labels(kitti_drive: Path, capsys: pytest.CaptureFixture
     found = json.loads(capsys.readouterr().out)
     assert found["scans"]["labelled_points"] == 0.0
     assert found["missing"]["motion"] == [] and found["missing"]["joint"] == ["labels of points"]
+
+
+def test_masks_without_a_class_to_align(kitti_drive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for file in (kitti_drive / "semantic_2").iterdir():
+        cv2.imwrite(str(file), np.zeros((6, 8), np.uint8))
+    assert main(["info", str(kitti_drive)]) == 0
+    said = capsys.readouterr().out
+    assert "masks of 100 % of the images, 100 % of all pixels: none that can be aligned\n" in said

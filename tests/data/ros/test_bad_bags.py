@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -169,6 +170,39 @@ def test_images_of_a_lens_that_distorts_are_rectified(tmp_path: Path) -> None:
     assert source.camera == rectification.camera
     pictures = [frame.image.pixels for frame in source if frame.image is not None]
     assert pictures and all((picture == rectification.picture(PIXELS)).all() for picture in pictures)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_camera_whose_model_changes_is_reported(
+    tmp_path: Path, kind: Kind, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The first model that is none of zeros is taken: a driver may publish zeros until it has one."""
+
+    def infos(*cameras: PinholeCamera | None) -> Callable[[BagWriter], None]:
+        def add(bag: BagWriter) -> None:
+            for k, camera in enumerate(cameras):
+                stamp_ns = EPOCH_NS + k * 50_000_000
+                message = bag.messages.info(camera or CAMERA, stamp_ns)
+                name = "K" if kind == "ros1" else "k"
+                bag.add(INFO, message if camera else replace(message, **{name: np.zeros(9)}), stamp_ns)
+
+        return add
+
+    other = replace(CAMERA, fx=40.0)
+    for k, (cameras, fx, others) in enumerate(
+        [
+            ((CAMERA, CAMERA, CAMERA), 30.0, 0),
+            ((CAMERA, other, CAMERA, other), 30.0, 2),
+            ((None, other, None, other), 40.0, 0),
+        ]
+    ):
+        caplog.clear()
+        folder = tmp_path / f"{k}"
+        folder.mkdir()
+        drive = open_source(made(folder, infos(*cameras), lambda bag: fill(bag, [INFO]), kind=kind))
+        assert drive.camera.fx == fx
+        said = f"{others} CameraInfo of {INFO} of another camera than the first"
+        assert (said in caplog.text) == (said in " ".join(drive.facts().notes)) == bool(others)
 
 
 def test_masks_with_stamps_of_no_image(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import tracemalloc
 import warnings
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -278,6 +280,39 @@ def test_a_chain_of_transforms_gives_the_pose_of_the_lidar_in_the_camera() -> No
     pose, words = transforms(MAKE.transforms(chain(CTL))).pose(CAMERA_FRAME, LIDAR_FRAME)
     assert pose is not None and pose.equals(CTL, 1e-9)
     assert words == f"by transforms {CAMERA_FRAME} - base_link - mast - {LIDAR_FRAME}"
+
+
+def _with_quaternion(message: Any, xyzw: Sequence[float], x: float = 0.0) -> Any:
+    """A TFMessage whose last transform has this quaternion, and this translation along x."""
+    *others, last = message.transforms
+    rotation = replace(last.transform.rotation, **dict(zip("xyzw", xyzw, strict=True)))
+    translation = replace(last.transform.translation, x=x)
+    changed = replace(last.transform, rotation=rotation, translation=translation)
+    return replace(message, transforms=[*others, replace(last, transform=changed)])
+
+
+@pytest.mark.parametrize(
+    ("xyzw", "x", "words"),
+    [
+        ((0.0, 0.0, 0.0, 0.0), 0.0, "a quaternion of length 0, not 1"),
+        ((1.0, 0.0, 0.0, 1.0), 0.0, "a quaternion of length 1.414, not 1"),
+        ((np.nan, 0.0, 0.0, 1.0), 0.0, "a quaternion of length nan, not 1"),
+        ((0.0, 0.0, 0.0, 1.0), np.inf, "a translation that is not finite"),
+    ],
+)
+def test_a_transform_that_is_none_gives_no_pose(xyzw: Sequence[float], x: float, words: str) -> None:
+    """Of messages that were never filled in gtsam would make the identity, of others no rotation."""
+    found = transforms(_with_quaternion(MAKE.transforms({(CAMERA_FRAME, LIDAR_FRAME): CTL}), xyzw, x))
+    expected = f"the transform from '{CAMERA_FRAME}' to '{LIDAR_FRAME}' has {words}"
+    assert found.pose(CAMERA_FRAME, LIDAR_FRAME) == (None, expected)
+    assert transforms().joined(found).pose(CAMERA_FRAME, LIDAR_FRAME) == (None, expected)
+
+
+def test_a_quaternion_typed_by_hand_gives_a_rotation() -> None:
+    message = MAKE.transforms({(CAMERA_FRAME, LIDAR_FRAME): CTL})
+    pose, _ = transforms(_with_quaternion(message, (0.7, 0.0, 0.0, 0.7))).pose(CAMERA_FRAME, LIDAR_FRAME)
+    assert pose is not None
+    np.testing.assert_allclose(pose.rotation().matrix(), gtsam.Rot3.Rx(np.pi / 2).matrix(), atol=1e-12)
 
 
 def test_chains_that_are_missing_moving_or_ambiguous_give_no_pose() -> None:

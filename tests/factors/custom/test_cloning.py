@@ -107,3 +107,13 @@ def test_the_factor_of_another_is_refused():
     assert recipe_of(foreign) is None
     with pytest.raises(FactorError, match="CustomFactor on 3: found one that another made"):
         clone_factor(foreign)
+
+
+def test_other_keys_are_distinct():
+    """Of a factor of gtsam as of one of ours: gtsam itself would take one variable twice."""
+    noise = gtsam.noiseModel.Isotropic.Sigma(6, 1.0)
+    between = gtsam.BetweenFactorPose3(1, 2, gtsam.Pose3(), noise)
+    assert list(rekeyed(between, {1: 2, 2: 1}).keys()) == [2, 1]
+    for new_keys in ({1: 2}, {1: 3, 2: 3}):
+        with pytest.raises(FactorError, match="distinct keys"):
+            rekeyed(between, new_keys)

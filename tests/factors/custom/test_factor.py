@@ -126,3 +126,36 @@ def test_the_data_is_freed_with_the_factor():
     del graph
     gc.collect()
     assert alive() is None
+
+
+@pytest.mark.parametrize(
+    ("error", "H", "found"),
+    [
+        (np.zeros(2, complex), [GOOD_H], "complex128"),
+        (np.ma.array([1.0, 2.0], mask=[False, True]), [GOOD_H], "1 masked value"),
+        (np.array(["1", "2"]), [GOOD_H], "<U1"),
+        (np.array([True, False]), [GOOD_H], "bool"),
+        (np.zeros(2), [GOOD_H + 0j], "complex128"),
+        (np.zeros(2), (GOOD_H for _ in range(1)), "a generator"),
+        (np.zeros(2), {7: GOOD_H}, "a dict"),
+        (np.zeros(2), 3.0, "3.0"),
+    ],
+)
+def test_what_is_no_number_and_no_list_of_jacobians_is_refused(error, H, found):
+    """A complex array would lose a part, a masked one its mask, in silence."""
+    with pytest.raises(FactorError) as raised:
+        factor_over(error, H).linearize(values3())
+    assert found in str(raised.value)
+
+
+@pytest.mark.parametrize("pair", [None, 3.0, np.zeros(2), (np.zeros(2),), (np.zeros(2), [GOOD_H], 1)])
+def test_a_function_returns_error_and_jacobians(pair):
+    factor = custom_factor(UNIT2, [7], lambda x, *, jacobians: pair, [3], 2)
+    with pytest.raises(FactorError, match="returns: found"):
+        factor.linearize(values3())
+
+
+@pytest.mark.parametrize("function", [lambda x: 1, lambda x, y, *, jacobians: 1, lambda: 1])
+def test_a_function_takes_a_value_for_each_key_and_jacobians(function):
+    with pytest.raises(FactorError, match=r"function of a factor: found one with the arguments \("):
+        custom_factor(UNIT2, [7], function, [3], 2)

@@ -11,13 +11,16 @@ from sst_graph.factors import (
     Between,
     DirectionSigmas,
     FactorError,
+    GncParams,
     GroupedBias,
     Vector,
     beta_regularizer,
+    check_gradient,
     check_jacobians,
     custom_factor,
     extrinsic_drift,
     frame_factor,
+    gnc,
     mean_velocity_factor,
     pose_alignment_factor,
     silhouette_factor,
@@ -371,3 +374,44 @@ def test_a_robust_noise_weighs_an_image_by_its_distance(bench, condensed):
 def test_what_is_no_noise_of_an_image_is_refused(bench, noise):
     with pytest.raises(FactorError, match=r"noise of pose_alignment_factor: found .*dimension"):
         pose_alignment_factor([bench.points], NEXT, E, D, noise=noise)
+
+
+def test_a_value_of_another_kind_than_a_factor_wants_is_named():
+    """Of a factor of gtsam, too: before a graph is solved, or Jacobians are compared."""
+    noise = gtsam.noiseModel.Isotropic.Sigma(6, 0.1)
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(gtsam.PriorFactorPose3(7, gtsam.Pose3(), noise))
+    scalar = gtsam.PriorFactorVector(8, np.zeros(1), gtsam.noiseModel.Isotropic.Sigma(1, 0.1))
+    values = gtsam.Values()
+    values.insert(7, gtsam.Rot3())
+    for call in (
+        lambda: gnc(graph, values, GncParams(6.0)),
+        lambda: check_jacobians(graph.at(0), values),
+        lambda: check_gradient(graph.at(0), values),
+    ):
+        with pytest.raises(FactorError, match="found Rot3 for 7, expected Pose3"):
+            call()
+    for value, said in ((0.0, "found double for 8, expected Vector"), (np.zeros(2), "a size for 8")):
+        values = gtsam.Values()
+        values.insert(8, value)
+        with pytest.raises(FactorError, match=said):
+            check_jacobians(scalar, values)
+
+
+def test_what_the_callback_of_another_raises_passes():
+    def broken(this, values, H):
+        raise ZeroDivisionError("a user's own")
+
+    factor = gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(1), [8], broken)
+    values = gtsam.Values()
+    values.insert(8, 0.0)
+    with pytest.raises(ZeroDivisionError, match="a user's own"):
+        check_gradient(factor, values)
+
+
+def test_reports_compare_by_identity():
+    values = gtsam.Values()
+    values.insert(8, np.zeros(1))
+    scalar = gtsam.PriorFactorVector(8, np.zeros(1), gtsam.noiseModel.Isotropic.Sigma(1, 0.1))
+    one, other = check_jacobians(scalar, values), check_jacobians(scalar, values)
+    assert one == one and one != other and len({one, other, one.blocks[0]}) == 3
