@@ -83,9 +83,11 @@ def cast_image(triangles: FloatArray, camera: PinholeCamera) -> tuple[IndexArray
 
     triangles: (n, 3, 3) corners in the camera frame [m]; faces seen from behind are left out.
     """
+    ahead = np.flatnonzero((triangles[:, :, 2] > NEAR_M).any(axis=1))
+    triangles = triangles.take(ahead, axis=0)
     normal, d = plane_of(triangles)
-    keep = np.flatnonzero((d < 0.0) & (triangles[:, :, 2].max(axis=1) > NEAR_M))
-    pieces, source = clip_near(triangles[keep])
+    keep = np.flatnonzero(d < 0.0)
+    pieces, source = clip_near(triangles.take(keep, axis=0))
     face = keep[source]
     x = camera.fx * pieces[:, :, 0] / pieces[:, :, 2] + camera.cx
     y = camera.fy * pieces[:, :, 1] / pieces[:, :, 2] + camera.cy
@@ -106,7 +108,7 @@ def cast_image(triangles: FloatArray, camera: PinholeCamera) -> tuple[IndexArray
     start = base[piece] + by_v[piece] * v + by_u[piece] * u0
     pixel = (v * camera.width + u0).astype(np.intp)[span] + step
     inverse = start[span] + by_u[piece][span] * step
-    best, closeness = nearest_faces(camera.width * camera.height, pixel, inverse, face[piece][span])
+    best, closeness = nearest_faces(camera.width * camera.height, pixel, inverse, ahead[face[piece]][span])
     depth = np.where(best >= 0, 1.0 / np.maximum(closeness, 1e-9), np.inf)
     shape = (camera.height, camera.width)
     return best.reshape(shape), depth.reshape(shape)

@@ -43,8 +43,22 @@ class Mesh:
         axes = self.textures[:, :, :3] @ rotation.T
         shift = self.textures[:, :, 3] - axes @ position
         textures = np.concatenate([axes, shift[:, :, None]], axis=2)
-        triangles = self.triangles @ rotation.T + position
+        triangles = self.placed_triangles(rotation, position)
         return Mesh(triangles, self.kinds, self.materials, self.colours, textures)
+
+    def placed_triangles(self, rotation: FloatArray, position: FloatArray) -> FloatArray:
+        """The corners alone of :meth:`placed`."""
+        return np.asarray(self.triangles @ rotation.T + position)
+
+    def part(self, pick: NDArray[np.intp]) -> Mesh:
+        """The faces ``pick`` alone."""
+        return Mesh(
+            self.triangles.take(pick, axis=0),
+            self.kinds.take(pick),
+            self.materials.take(pick),
+            self.colours.take(pick, axis=0),
+            self.textures.take(pick, axis=0),
+        )
 
     def recoloured(self, mask: NDArray[np.bool_], material: Material, colour: Colour) -> Mesh:
         """The mesh with another material and colour on the faces of ``mask`` (n,)."""
@@ -63,6 +77,12 @@ def normals_of(triangles: FloatArray) -> FloatArray:
     """(n, 3) outward unit normals of triangles (n, 3, 3)."""
     normals = _cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     return np.asarray(normals / np.maximum(np.sqrt((normals**2).sum(axis=1, keepdims=True)), 1e-12))
+
+
+def seen_from(points: FloatArray, rotation: FloatArray, position: FloatArray) -> FloatArray:
+    """World points (..., 3) in the frame of a pose: rotation (3, 3), position (3,) [m]."""
+    away = (points - position).reshape(-1, 3)  # one product of matrices, not one for each triangle
+    return np.asarray(away @ rotation).reshape(points.shape)
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -98,6 +118,8 @@ def soup(triangles: FloatArray, kind: Kind, material: Material | int, colour: Co
 
 def merged(meshes: list[Mesh]) -> Mesh:
     """All faces of ``meshes`` in one mesh."""
+    if len(meshes) == 1:
+        return meshes[0]
     return Mesh(
         np.concatenate([m.triangles for m in meshes]),
         np.concatenate([m.kinds for m in meshes]),

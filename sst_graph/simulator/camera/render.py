@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.simulator.camera.textures import LEVELS, TILE, Atlas
 from sst_graph.simulator.casting import IndexArray, compact
-from sst_graph.simulator.mesh import Mesh, normals_of
+from sst_graph.simulator.mesh import Mesh, normals_of, seen_from
 from sst_graph.simulator.surfaces import DETAIL, TILE_M, Material
 from sst_graph.types import FloatArray
 
@@ -54,7 +54,7 @@ class View:
 
     def to_camera(self, points: FloatArray) -> FloatArray:
         """World points (..., 3) in the camera frame [m]."""
-        return np.asarray((points - self.position) @ self.rotation)
+        return seen_from(points, self.rotation, self.position)
 
 
 def shade(view: View, mesh: Mesh, faces: IndexArray, depth: FloatArray, look: Look) -> NDArray[Any]:
@@ -63,9 +63,7 @@ def shade(view: View, mesh: Mesh, faces: IndexArray, depth: FloatArray, look: Lo
     if seen[0] < 0:
         # The sky borrows any face; it is painted over below.
         seen = np.concatenate([[0], seen[1:]])
-    part = Mesh(
-        mesh.triangles[seen], mesh.kinds[seen], mesh.materials[seen], mesh.colours[seen], mesh.textures[seen]
-    )
+    part = mesh.part(seen)
     ground = faces >= 0
     z = np.where(ground, depth, 1.0).astype(np.float32)
     albedo = _textured(view, part, index, z, look)
