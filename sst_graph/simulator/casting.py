@@ -19,6 +19,9 @@ NEAR_M = 0.1
 
 IndexArray = NDArray[np.intp]
 
+AT_ONCE = 8192
+"""Faces, or pairs of a face and a column, that are looked at together: they stay in the processor's cache."""
+
 
 def runs(counts: IndexArray) -> tuple[IndexArray, IndexArray]:
     """For runs of given lengths: the run each element belongs to, and its place in the run."""
@@ -83,11 +86,9 @@ def cast_image(triangles: FloatArray, camera: PinholeCamera) -> tuple[IndexArray
 
     triangles: (n, 3, 3) corners in the camera frame [m]; faces seen from behind are left out.
     """
-    ahead = np.flatnonzero((triangles[:, :, 2] > NEAR_M).any(axis=1))
-    triangles = triangles.take(ahead, axis=0)
     normal, d = plane_of(triangles)
-    keep = np.flatnonzero(d < 0.0)
-    pieces, source = clip_near(triangles.take(keep, axis=0))
+    keep = np.flatnonzero((d < 0.0) & (triangles[:, :, 2].max(axis=1) > NEAR_M))
+    pieces, source = clip_near(triangles[keep])
     face = keep[source]
     x = camera.fx * pieces[:, :, 0] / pieces[:, :, 2] + camera.cx
     y = camera.fy * pieces[:, :, 1] / pieces[:, :, 2] + camera.cy
@@ -108,7 +109,7 @@ def cast_image(triangles: FloatArray, camera: PinholeCamera) -> tuple[IndexArray
     start = base[piece] + by_v[piece] * v + by_u[piece] * u0
     pixel = (v * camera.width + u0).astype(np.intp)[span] + step
     inverse = start[span] + by_u[piece][span] * step
-    best, closeness = nearest_faces(camera.width * camera.height, pixel, inverse, ahead[face[piece]][span])
+    best, closeness = nearest_faces(camera.width * camera.height, pixel, inverse, face[piece][span])
     depth = np.where(best >= 0, 1.0 / np.maximum(closeness, 1e-9), np.inf)
     shape = (camera.height, camera.width)
     return best.reshape(shape), depth.reshape(shape)

@@ -5,7 +5,8 @@ Faces run counter-clockwise seen from outside. Frames: x forward, y left, z up, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +41,7 @@ class Mesh:
 
     def placed(self, rotation: FloatArray, position: FloatArray) -> Mesh:
         """The mesh moved by p -> rotation p + position; the textures move along."""
-        axes = self.textures[:, :, :3] @ rotation.T
+        axes = _turned(self.textures[:, :, :3], rotation)
         shift = self.textures[:, :, 3] - axes @ position
         textures = np.concatenate([axes, shift[:, :, None]], axis=2)
         triangles = self.placed_triangles(rotation, position)
@@ -48,7 +49,7 @@ class Mesh:
 
     def placed_triangles(self, rotation: FloatArray, position: FloatArray) -> FloatArray:
         """The corners alone of :meth:`placed`."""
-        return np.asarray(self.triangles @ rotation.T + position)
+        return _turned(self.triangles, rotation) + position
 
     def part(self, pick: NDArray[np.intp]) -> Mesh:
         """The faces ``pick`` alone."""
@@ -81,8 +82,12 @@ def normals_of(triangles: FloatArray) -> FloatArray:
 
 def seen_from(points: FloatArray, rotation: FloatArray, position: FloatArray) -> FloatArray:
     """World points (..., 3) in the frame of a pose: rotation (3, 3), position (3,) [m]."""
-    away = (points - position).reshape(-1, 3)  # one product of matrices, not one for each triangle
-    return np.asarray(away @ rotation).reshape(points.shape)
+    return _turned(points - position, rotation.T)
+
+
+def _turned(points: FloatArray, rotation: FloatArray) -> FloatArray:
+    """(..., 3) rotated; one product of matrices in place of one for each triangle."""
+    return np.asarray(points.reshape(-1, 3) @ rotation.T).reshape(points.shape)
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -118,8 +123,6 @@ def soup(triangles: FloatArray, kind: Kind, material: Material | int, colour: Co
 
 def merged(meshes: list[Mesh]) -> Mesh:
     """All faces of ``meshes`` in one mesh."""
-    if len(meshes) == 1:
-        return meshes[0]
     return Mesh(
         np.concatenate([m.triangles for m in meshes]),
         np.concatenate([m.kinds for m in meshes]),
@@ -127,6 +130,20 @@ def merged(meshes: list[Mesh]) -> Mesh:
         np.concatenate([m.colours for m in meshes]),
         np.concatenate([m.textures for m in meshes]),
     )
+
+
+def extended(mesh: Mesh, pick: NDArray[np.intp], more: list[Mesh]) -> Mesh:
+    """The faces ``pick`` of a mesh, and all of further ones after them; each is copied once."""
+
+    def joined(name: str) -> NDArray[Any]:
+        first, rest = getattr(mesh, name), [getattr(m, name) for m in more]
+        whole = np.empty((len(pick) + sum(map(len, rest)), *first.shape[1:]), first.dtype)
+        first.take(pick, axis=0, out=whole[: len(pick)], mode="clip")
+        if rest:
+            np.concatenate(rest, out=whole[len(pick) :])
+        return whole
+
+    return Mesh(*(joined(field.name) for field in fields(Mesh)))
 
 
 def grid_triangles(points: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sst_graph.simulator import scenery
 from sst_graph.simulator.config import SimulationConfig
-from sst_graph.simulator.mesh import Mesh, merged, yaw_rotation
+from sst_graph.simulator.mesh import Mesh, extended, merged, yaw_rotation
 from sst_graph.simulator.motion import (
     STEP_S,
     EgoMotion,
@@ -113,8 +113,7 @@ class Street:
         here = self.ego.pose(np.array([t]))[1][0, :2]
         near = np.linalg.norm(self.centres - here, axis=1) - self.radii < range_m
         pick = np.flatnonzero(near[self.owners])
-        static = self.static
-        meshes = [static.part(pick)]
+        meshes: list[Mesh] = []
         instances, velocities = [self.instances[pick]], [np.zeros((len(pick), 3, 3))]
         ego_s, half = float(np.interp(t, self.ego.t, self.ego.s)), 0.02
         for vehicle in self.moving:
@@ -125,7 +124,9 @@ class Street:
             meshes.append(mesh)
             instances.append(np.full(len(mesh), vehicle.instance, np.uint16))
             velocities.append((later - earlier) / (2 * half))
-        return Snapshot(merged(meshes), np.concatenate(instances), np.concatenate(velocities))
+        return Snapshot(
+            extended(self.static, pick, meshes), np.concatenate(instances), np.concatenate(velocities)
+        )
 
 
 class _Builder:

@@ -11,11 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.simulator.casting import IndexArray, nearest_faces, runs
+from sst_graph.simulator.casting import AT_ONCE, IndexArray, nearest_faces, runs
 from sst_graph.types import FloatArray
-
-_AT_ONCE = 8192
-"""Pairs of faces and columns that are cut at once: so many stay in the processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -113,8 +110,8 @@ def cast_lidar(
         at, n = at.take(front, axis=2), n.take(front, axis=1) / dd[front]
         face, column = face[front], column[front]
     beams = [_Beam(columns.azimuths + shift, columns.slopes) for shift in shifts]
-    for begin in range(0, len(face), _AT_ONCE):
-        part = slice(begin, begin + _AT_ONCE)
+    for begin in range(0, len(face), AT_ONCE):
+        part = slice(begin, begin + AT_ONCE)
         some = face[part]
         if motion is None:  # all that was kept is seen from its front
             cut = corners.take(some, axis=2), planes.take(some, axis=1)
