@@ -7,6 +7,7 @@ meet it, and the rings between the two cuts hit it. See :mod:`sst_graph.simulato
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,14 +55,18 @@ class SweepMotion:
     velocities: FloatArray
     cut: float = np.pi
 
+    @cached_property
+    def moving(self) -> NDArray[np.bool_]:
+        """(n,) which faces move."""
+        return np.asarray(np.any(self.velocities, axis=(1, 2)))
+
     def seen(self, corners: FloatArray, face: IndexArray, column: IndexArray) -> FloatArray:
         """(3, 3, m) corners (corner, axis, pair) of faces in the sensor's frame at the columns' times.
 
         corners: (3, 3, n) of all faces (corner, axis, face) in its frame at the stamp [m].
         """
-        moving = np.any(self.velocities, axis=(1, 2))
         at = corners.take(face, axis=2)
-        pairs = np.flatnonzero(moving[face])
+        pairs = np.flatnonzero(self.moving[face])
         if len(pairs):
             speed = self.velocities[face[pairs]].transpose(1, 2, 0)
             at[:, :, pairs] += speed * self.seconds[column[pairs]]
@@ -72,6 +77,7 @@ class SweepMotion:
             [at[:, 0] * turn[0, k] + at[:, 1] * turn[1, k] + at[:, 2] * turn[2, k] for k in range(3)], axis=1
         )
 
+    @cached_property
     def reach(self) -> tuple[FloatArray, float]:
         """Bounds: (n,) displacement of each face relative to the sensor [m], the sensor's rotation [rad]."""
         half = float(np.abs(self.seconds).max())
@@ -98,27 +104,24 @@ def cast_lidar(
     normal = _normals(corners)
     d = (normal * corners[0]).sum(axis=0)
     size = np.maximum(np.sqrt((normal**2).sum(axis=0)), 1e-12)
-    slack: FloatArray | float = 0.0 if motion is None else motion.reach()[0]
+    slack: FloatArray | float = 0.0 if motion is None else motion.reach[0]
     kept = np.flatnonzero(d / size < slack)
     face, column = _candidate_pairs(corners, kept, columns, max(abs(shift) for shift in shifts), motion)
     planes = normal / np.where(d < 0.0, d, -1.0)
-    if motion is not None:
-        at = motion.seen(corners, face, column)
-        n = _normals(at)
-        dd = (n * at[0]).sum(axis=0)
-        front = np.flatnonzero(dd < 0.0)
-        at, n = at.take(front, axis=2), n.take(front, axis=1) / dd[front]
-        face, column = face[front], column[front]
     beams = [_Beam(columns.azimuths + shift, columns.slopes) for shift in shifts]
     for begin in range(0, len(face), AT_ONCE):
-        part = slice(begin, begin + AT_ONCE)
-        some = face[part]
+        some, by = face[begin : begin + AT_ONCE], column[begin : begin + AT_ONCE]
         if motion is None:  # all that was kept is seen from its front
-            cut = corners.take(some, axis=2), planes.take(some, axis=1)
+            at, n = corners.take(some, axis=2), planes.take(some, axis=1)
         else:
-            cut = at[:, :, part], n[:, part]
+            at = motion.seen(corners, some, by)
+            n = _normals(at)
+            dd = (n * at[0]).sum(axis=0)
+            front = np.flatnonzero(dd < 0.0)
+            at, n = at.take(front, axis=2), n.take(front, axis=1) / dd[front]
+            some, by = some[front], by[front]
         for beam in beams:
-            beam.add(*cut, below[some], column[part])
+            beam.add(at, n, below[some], by)
     return [beam.nearest() for beam in beams]
 
 
@@ -181,7 +184,7 @@ def _candidate_pairs(
     pad: FloatArray | float = 0.0
     shift: FloatArray | float = 0.0
     if motion is not None:
-        reach, turn = motion.reach()
+        reach, turn = motion.reach
         reach = reach[kept]
         wide = turn + np.arcsin(np.minimum(reach / distance, 1.0))
         # Look again at the time at which the beam passes; what moves from then on is less by the
