@@ -83,7 +83,7 @@ class Command:
 
 
 def _calibrate(data: Path, desk: Path) -> list[str]:
-    return ["calibrate", str(data / "street"), "--out", str(desk / "out"), "--frames", "0:3"]
+    return ["calibrate", str(data / "street"), "--frames", "0:3", "--out", str(desk / "out")]
 
 
 def _track(data: Path, desk: Path) -> list[str]:
@@ -191,8 +191,7 @@ class Bench:
         if not self.data.exists():
             self.data.mkdir(parents=True)
             write_drive(simulate(STREET), self.data / "street")
-            arguments = _calibrate(self.data, self.data)
-            self.run([*arguments[:-4], "--out", str(self.data / "result")])
+            self.run([*_calibrate(self.data, self.data)[:-1], str(self.data / "result"), "--no-report"])
 
     def desk(self) -> Path:
         """An empty folder to write into."""

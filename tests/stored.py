@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate, write_drive
+from sst_graph.simulator.street import build_street
 
 FOLDER = "SST_GRAPH_TEST_FOLDER"
 """Environment variable: folder of the session, made by conftest.py before the workers start."""
@@ -47,7 +48,16 @@ def _name(key: object) -> str:
 
 @dataclass(frozen=True)
 class StoredDrive(SimulatedDrive):
-    """A simulated drive whose scans and images are :func:`stored`, however they are asked for."""
+    """A simulated drive whose scans and images are :func:`stored`, however they are asked for.
+
+    Its street is built when it is asked for: what is stored needs none.
+    """
+
+    def __getattr__(self, name: str) -> Any:
+        if name != "street":
+            raise AttributeError(name)
+        object.__setattr__(self, name, build_street(self.config))
+        return self.street
 
     def _scan(self, index: int) -> Any:
         make = partial(super()._scan, index)
@@ -65,7 +75,14 @@ _DRIVES: dict[SimulationConfig, StoredDrive] = {}
 def simulated(config: SimulationConfig) -> StoredDrive:
     """As :func:`sst_graph.simulator.simulate`, but each scan and image is rendered once a session."""
     if config not in _DRIVES:
-        _DRIVES[config] = StoredDrive(**vars(simulate(config)))
+        drive = _DRIVES[config] = object.__new__(StoredDrive)
+        built: dict[str, Any] = {}
+
+        def make() -> dict[str, Any]:
+            built.update(vars(simulate(config)))
+            return {name: value for name, value in built.items() if name != "street"}
+
+        vars(drive).update(stored((config, "drive"), make) | built)
     return _DRIVES[config]
 
 

@@ -12,7 +12,6 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from sst_graph.cameras.model import BoolArray, CameraModel, FloatArray
 from sst_graph.errors import ConfigError, DataError
@@ -130,7 +129,7 @@ class Rectification:
     @cached_property
     def _fill(self) -> tuple[NDArray[np.intp], ...]:
         """Rows and columns of the pixels without source, and of the nearest one with a source."""
-        nearest = ndimage.distance_transform_edt(~self.valid, return_distances=False, return_indices=True)
+        nearest = _nearest(~self.valid)
         rows, columns = np.nonzero(~self.valid)
         return rows, columns, nearest[0][rows, columns], nearest[1][rows, columns]
 
@@ -154,7 +153,7 @@ class Rectification:
         squares = A.reshape(len(vs), len(us), 4)[:, :, [0, 1, 3]].astype(np.float32)
         # Beyond the lens's field as at the nearest place within it.
         missing = ~known.reshape(len(vs), len(us))
-        nearest = ndimage.distance_transform_edt(missing, return_distances=False, return_indices=True)
+        nearest = _nearest(missing)
         return PixelStretch(squares[nearest[0], nearest[1]], _STRETCH_STEP_PX)
 
     def picture(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -224,3 +223,10 @@ class Rectification:
             raise DataError(
                 "rectification", found, f"{self.model.width}x{self.model.height} px, the camera's"
             )
+
+
+def _nearest(missing: BoolArray) -> NDArray[np.intp]:
+    """(2, h, w) row and column of the nearest place that is not missing."""
+    from scipy import ndimage  # every reader imports this module, and only distorted cameras need that
+
+    return np.asarray(ndimage.distance_transform_edt(missing, return_distances=False, return_indices=True))

@@ -6,17 +6,19 @@ import argparse
 import json
 import os
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import gtsam
 
-from sst_graph.batch import CalibrationConfig
 from sst_graph.cli.messages import complain
 from sst_graph.cli.reading import open_drive
 from sst_graph.config import read_config, with_overrides
 from sst_graph.errors import ConfigError
 from sst_graph.imports import ImportOptions, import_calibration
 from sst_graph.types import SemanticClass, Source
+
+if TYPE_CHECKING:
+    from sst_graph.batch import CalibrationConfig
 
 T = TypeVar("T")
 
@@ -73,6 +75,8 @@ def settings(default: T, args: argparse.Namespace, flags: dict[str, Any]) -> T:
 
 def calibration_settings(args: argparse.Namespace) -> CalibrationConfig:
     """The settings that ``calibrate`` was given."""
+    from sst_graph.batch import CalibrationConfig  # not all commands that read inputs calibrate
+
     flags = {
         "method": args.method,
         "classes": chosen_classes(args.classes),

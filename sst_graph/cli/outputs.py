@@ -1,12 +1,10 @@
-"""What the commands leave behind: kinds of outputs, a calibration's files, and the exit code of a result."""
+"""What the commands leave behind: the files of a calibration, and the exit code of a result."""
 
 from __future__ import annotations
 
 import dataclasses
-import itertools
-import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +13,7 @@ from sst_graph.cli.messages import complain, loudness
 from sst_graph.cli.pictures import ShownFrame, overlay, png, telling_positions
 from sst_graph.cli.progress import ProgressBar, ProgressStage
 from sst_graph.data.frame_parts import RecentReader
-from sst_graph.errors import ConfigError
-from sst_graph.files import FileKind, OutputKind
+from sst_graph.files import OutputKind
 from sst_graph.inspect.inspection import inspect_result, to_dict
 from sst_graph.inspect.reasons import short_reasons
 from sst_graph.inspect.report import Comparison, markdown_report
@@ -31,14 +28,6 @@ RESULT_NAME = "calibration.json"
 REPORT_NAME = "report.html"
 
 CALIBRATION = OutputKind("calibration")
-RESULT_FILE = FileKind("a calibration.json", lambda head: b'"sst-graph/calibration"' in head)
-CHECKPOINT_FILE = FileKind("a checkpoint of the tracker", lambda head: b"head.npy" in head[:64])
-RERUN_FILE = FileKind("a recording of rerun", lambda head: head.startswith(b"RRF"))
-PNG_FILE = FileKind("a PNG", lambda head: head.startswith(b"\x89PNG\r\n"))
-
-_NO_PATHS = ("dataset", "none", "initial")
-"""Choices of ``--init`` and ``--before`` that are no files."""
-
 PICTURES = 3
 """Overlays of a calibration, over all its drives."""
 
@@ -136,39 +125,6 @@ def why_not_ok(result: CalibrationResult) -> str:
     where = "in the report" if loudness.quiet else "in the summary; in full in the report"
     more = f" ({len(others)} more {where})" if others else ""
     return f"{result.status}: {first}{more}"
-
-
-def check_apart(
-    inputs: Mapping[str, str | Path | None],
-    outputs: Mapping[str, Path | None],
-) -> None:
-    """Refuse outputs that are the same file, or that would replace what is read.
-
-    Args:
-        inputs: what is read, by the name of its option; None and choices that are no paths are passed over.
-        outputs: what is to be written, by the name of its option.
-
-    Raises:
-        ConfigError: two of them are one, or an input lies in a folder that would be replaced.
-    """
-    written = {name: Path(os.path.realpath(path)) for name, path in outputs.items() if path is not None}
-    for (first, a), (second, b) in itertools.combinations(written.items(), 2):
-        if _same(a, b):
-            raise ConfigError(f"{first} and {second}: found the same file {outputs[first]}, expected two")
-    named = {name: path for name, path in inputs.items() if path is not None and path not in _NO_PATHS}
-    read = {name: Path(os.path.realpath(path)) for name, path in named.items()}
-    for (output, a), (given, b) in itertools.product(written.items(), read.items()):
-        if _same(a, b) or a in b.parents:
-            raise ConfigError(
-                f"{output} {outputs[output]}: is read as {given} and would be replaced, expected another name"
-            )
-
-
-def _same(a: Path, b: Path) -> bool:
-    try:
-        return a == b or os.path.samefile(a, b)
-    except OSError:
-        return False
 
 
 def placement_before(result: CalibrationResult, source: Source) -> Placement | None:

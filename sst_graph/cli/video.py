@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.cli.drive_motion import DriveMotion
-from sst_graph.cli.outputs import check_apart, placement_before
+from sst_graph.cli.output_places import check_apart
+from sst_graph.cli.outputs import placement_before
 from sst_graph.cli.pictures import ShownFrame, overlay
 from sst_graph.cli.progress import ProgressBar
 from sst_graph.data.frame_parts import RecentReader, scan_positions

@@ -19,6 +19,9 @@ NEAR_M = 0.1
 
 IndexArray = NDArray[np.intp]
 
+AT_ONCE = 8192
+"""Faces, or pairs of a face and a column, that are looked at together: they stay in the processor's cache."""
+
 
 def runs(counts: IndexArray) -> tuple[IndexArray, IndexArray]:
     """For runs of given lengths: the run each element belongs to, and its place in the run."""

@@ -213,7 +213,10 @@ class SimulatedDrive:
         if cRv is not None:
             rotation = rotation @ cRv
         view = View(camera, rotation, np.asarray(pose.translation()))
-        faces, depth = cast_image(view.to_camera(snapshot.mesh.triangles), camera)
+        triangles = snapshot.mesh.triangles
+        seen = view.in_sight(triangles)
+        faces, depth = cast_image(view.to_camera(triangles.take(seen, axis=0)), camera)
+        faces = np.append(seen, -1)[faces]  # -1 stays -1
         light = shade(view, snapshot.mesh, faces, depth, self.look)
         kinds = np.where(faces >= 0, snapshot.mesh.kinds[faces], np.uint8(Kind.SKY)).astype(np.uint8)
         numbers = np.where(is_instance(kinds), snapshot.instances[faces], 0).astype(np.uint16)

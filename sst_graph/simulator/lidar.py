@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sst_graph.simulator.casting import IndexArray, compact
 from sst_graph.simulator.config import SimulationConfig
-from sst_graph.simulator.mesh import normals_of
+from sst_graph.simulator.mesh import normals_of, seen_from
 from sst_graph.simulator.motion import EgoMotion
 from sst_graph.simulator.street import Snapshot
 from sst_graph.simulator.surfaces import EXTRA_LOSS, Kind, Material
@@ -56,7 +56,7 @@ class Lidar:
         """One sweep at the stamp [s] through the faces of the snapshot (taken at that stamp)."""
         config = self.config
         rotation, position = (a[0] for a in ego.pose(np.array([stamp_s])))
-        triangles = (snapshot.mesh.triangles - position) @ rotation
+        triangles = seen_from(snapshot.mesh.triangles, rotation, position)
         velocities = snapshot.velocities @ rotation
         count = round(360.0 / config.azimuth_step_deg)
         step, start = 2 * np.pi / count, rng.uniform(-0.5, 0.5) * 2 * np.pi / count

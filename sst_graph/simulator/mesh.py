@@ -5,7 +5,8 @@ Faces run counter-clockwise seen from outside. Frames: x forward, y left, z up, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,11 +41,25 @@ class Mesh:
 
     def placed(self, rotation: FloatArray, position: FloatArray) -> Mesh:
         """The mesh moved by p -> rotation p + position; the textures move along."""
-        axes = self.textures[:, :, :3] @ rotation.T
+        axes = _turned(self.textures[:, :, :3], rotation)
         shift = self.textures[:, :, 3] - axes @ position
         textures = np.concatenate([axes, shift[:, :, None]], axis=2)
-        triangles = self.triangles @ rotation.T + position
+        triangles = self.placed_triangles(rotation, position)
         return Mesh(triangles, self.kinds, self.materials, self.colours, textures)
+
+    def placed_triangles(self, rotation: FloatArray, position: FloatArray) -> FloatArray:
+        """The corners alone of :meth:`placed`."""
+        return _turned(self.triangles, rotation) + position
+
+    def part(self, pick: NDArray[np.intp]) -> Mesh:
+        """The faces ``pick`` alone."""
+        return Mesh(
+            self.triangles.take(pick, axis=0),
+            self.kinds.take(pick),
+            self.materials.take(pick),
+            self.colours.take(pick, axis=0),
+            self.textures.take(pick, axis=0),
+        )
 
     def recoloured(self, mask: NDArray[np.bool_], material: Material, colour: Colour) -> Mesh:
         """The mesh with another material and colour on the faces of ``mask`` (n,)."""
@@ -65,20 +80,35 @@ def normals_of(triangles: FloatArray) -> FloatArray:
     return np.asarray(normals / np.maximum(np.sqrt((normals**2).sum(axis=1, keepdims=True)), 1e-12))
 
 
+def seen_from(points: FloatArray, rotation: FloatArray, position: FloatArray) -> FloatArray:
+    """World points (..., 3) in the frame of a pose: rotation (3, 3), position (3,) [m]."""
+    return _turned(points - position, rotation.T)
+
+
+def _turned(points: FloatArray, rotation: FloatArray) -> FloatArray:
+    """(..., 3) rotated; one product of matrices in place of one for each triangle."""
+    return np.asarray(points.reshape(-1, 3) @ rotation.T).reshape(points.shape)
+
+
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """(n, 3) cross products of the rows of a and b (n, 3)."""
     (ax, ay, az), (bx, by, bz) = a.T, b.T
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
+    product = np.empty_like(a)
+    product[:, 0], product[:, 1], product[:, 2] = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    return product
 
 
 def planar_textures(triangles: FloatArray) -> FloatArray:
     """(n, 2, 4) texture frames in each face's plane: along the horizontal and up the slope."""
     normals = normals_of(triangles)
-    along = np.stack([-normals[:, 1], normals[:, 0], np.zeros(len(normals))], axis=1)
+    along = np.zeros_like(normals)
+    along[:, 0], along[:, 1] = -normals[:, 1], normals[:, 0]
     size = np.sqrt((along**2).sum(axis=1, keepdims=True))
     flat = size[:, 0] < 0.3
-    along = np.where(flat[:, None], np.array([1.0, 0.0, 0.0]), along / np.maximum(size, 1e-12))
-    up = np.where(flat[:, None], np.array([0.0, 1.0, 0.0]), _cross(normals, along))
+    along /= np.maximum(size, 1e-12)
+    along[flat] = (1.0, 0.0, 0.0)
+    up = _cross(normals, along)
+    up[flat] = (0.0, 1.0, 0.0)
     textures = np.zeros((len(triangles), 2, 4))
     textures[:, 0, :3], textures[:, 1, :3] = along, up
     return textures
@@ -91,7 +121,7 @@ def soup(triangles: FloatArray, kind: Kind, material: Material | int, colour: Co
         triangles,
         np.full(n, kind, np.uint8),
         np.full(n, material, np.uint8),
-        np.tile(np.asarray(colour, np.float32), (n, 1)),
+        np.full((n, 3), colour, np.float32),
         planar_textures(triangles),
     )
 
@@ -107,13 +137,29 @@ def merged(meshes: list[Mesh]) -> Mesh:
     )
 
 
+def extended(mesh: Mesh, pick: NDArray[np.intp], more: list[Mesh]) -> Mesh:
+    """The faces ``pick`` of a mesh, and all of further ones after them; each is copied once."""
+
+    def joined(name: str) -> NDArray[Any]:
+        first, rest = getattr(mesh, name), [getattr(m, name) for m in more]
+        whole = np.empty((len(pick) + sum(map(len, rest)), *first.shape[1:]), first.dtype)
+        first.take(pick, axis=0, out=whole[: len(pick)], mode="clip")
+        if rest:
+            np.concatenate(rest, out=whole[len(pick) :])
+        return whole
+
+    return Mesh(*(joined(field.name) for field in fields(Mesh)))
+
+
 def grid_triangles(points: FloatArray) -> FloatArray:
     """(2 (r-1) (c-1), 3, 3) triangles of a grid of points (r, c, 3); columns to the left of rows
     (row direction x column direction points outward)."""
     a, b, c, d = points[:-1, :-1], points[1:, :-1], points[1:, 1:], points[:-1, 1:]
-    return np.concatenate(
-        [np.stack([a, b, c], axis=2).reshape(-1, 3, 3), np.stack([a, c, d], axis=2).reshape(-1, 3, 3)]
-    )
+    triangles = np.empty((2, *a.shape[:2], 3, 3))
+    for half, corners in zip(triangles, ((a, b, c), (a, c, d)), strict=True):
+        for k, corner in enumerate(corners):
+            half[:, :, k] = corner
+    return triangles.reshape(-1, 3, 3)
 
 
 def loft_triangles(sections: FloatArray, caps: bool = True) -> FloatArray:
@@ -124,8 +170,9 @@ def loft_triangles(sections: FloatArray, caps: bool = True) -> FloatArray:
     parts = [grid_triangles(closed)[:, ::-1]]
     if caps:
         for section, reverse in ((sections[0], True), (sections[-1], False)):
-            centre = np.broadcast_to(section.mean(axis=0), section.shape)
-            fan = np.stack([centre, section, np.roll(section, -1, axis=0)], axis=1)
+            fan = np.empty((len(section), 3, 3))
+            fan[:, 0], fan[:, 1] = section.mean(axis=0), section
+            fan[:-1, 2], fan[-1, 2] = section[1:], section[0]
             parts.append(fan[:, ::-1] if reverse else fan)
     return np.concatenate(parts)
 
@@ -144,9 +191,9 @@ def cylinder_triangles(
     """Triangles of a (conical) cylinder between two axis points with ``sides`` faces around [m]."""
     axis = (end - start) / np.linalg.norm(end - start)
     helper = np.array([0.0, 0.0, 1.0]) if abs(axis[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
-    first = np.cross(helper, axis)
+    (first,) = _cross(helper[None], axis[None])
     first /= np.linalg.norm(first)
-    second = np.cross(axis, first)
+    (second,) = _cross(axis[None], first[None])
     angles = 2 * np.pi * np.arange(sides) / sides
     circle = np.cos(angles)[:, None] * first + np.sin(angles)[:, None] * second
     return loft_triangles(np.stack([start + radii[0] * circle, end + radii[1] * circle]))

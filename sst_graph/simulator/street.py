@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sst_graph.simulator import scenery
 from sst_graph.simulator.config import SimulationConfig
-from sst_graph.simulator.mesh import Mesh, merged, yaw_rotation
+from sst_graph.simulator.mesh import Mesh, extended, merged, yaw_rotation
 from sst_graph.simulator.motion import (
     STEP_S,
     EgoMotion,
@@ -51,12 +51,20 @@ class MovingVehicle:
         """Arc length at time t [m]."""
         return float(np.interp(t, self.t, self.s))
 
-    def mesh_at(self, path: Path, t: float) -> Mesh:
-        """The mesh in the world at time t [s]."""
+    def pose_at(self, path: Path, t: float) -> tuple[FloatArray, FloatArray]:
+        """Rotation (3, 3) and position (3,) [m] in the world at time t [s]."""
         rotation, position = path.frame(self.arc_length(t), self.left)
         if self.turned:
             rotation = rotation @ yaw_rotation(np.pi)
-        return self.mesh.placed(rotation, position)
+        return rotation, position
+
+    def mesh_at(self, path: Path, t: float) -> Mesh:
+        """The mesh in the world at time t [s]."""
+        return self.mesh.placed(*self.pose_at(path, t))
+
+    def triangles_at(self, path: Path, t: float) -> FloatArray:
+        """(n, 3, 3) corners in the world at time t [s, m]."""
+        return self.mesh.placed_triangles(*self.pose_at(path, t))
 
 
 @dataclass(frozen=True)
@@ -105,27 +113,20 @@ class Street:
         here = self.ego.pose(np.array([t]))[1][0, :2]
         near = np.linalg.norm(self.centres - here, axis=1) - self.radii < range_m
         pick = np.flatnonzero(near[self.owners])
-        static = self.static
-        meshes = [
-            Mesh(
-                static.triangles[pick],
-                static.kinds[pick],
-                static.materials[pick],
-                static.colours[pick],
-                static.textures[pick],
-            )
-        ]
+        meshes: list[Mesh] = []
         instances, velocities = [self.instances[pick]], [np.zeros((len(pick), 3, 3))]
         ego_s, half = float(np.interp(t, self.ego.t, self.ego.s)), 0.02
         for vehicle in self.moving:
             if abs(vehicle.arc_length(t) - ego_s) > range_m:
                 continue
             mesh = vehicle.mesh_at(self.path, t)
-            later, earlier = vehicle.mesh_at(self.path, t + half), vehicle.mesh_at(self.path, t - half)
+            later, earlier = (vehicle.triangles_at(self.path, t + side) for side in (half, -half))
             meshes.append(mesh)
             instances.append(np.full(len(mesh), vehicle.instance, np.uint16))
-            velocities.append((later.triangles - earlier.triangles) / (2 * half))
-        return Snapshot(merged(meshes), np.concatenate(instances), np.concatenate(velocities))
+            velocities.append((later - earlier) / (2 * half))
+        return Snapshot(
+            extended(self.static, pick, meshes), np.concatenate(instances), np.concatenate(velocities)
+        )
 
 
 class _Builder:

@@ -7,11 +7,12 @@ meet it, and the rings between the two cuts hit it. See :mod:`sst_graph.simulato
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.simulator.casting import IndexArray, nearest_faces, runs
+from sst_graph.simulator.casting import AT_ONCE, IndexArray, nearest_faces, runs
 from sst_graph.types import FloatArray
 
 
@@ -54,24 +55,29 @@ class SweepMotion:
     velocities: FloatArray
     cut: float = np.pi
 
+    @cached_property
+    def moving(self) -> NDArray[np.bool_]:
+        """(n,) which faces move."""
+        return np.asarray(np.any(self.velocities, axis=(1, 2)))
+
     def seen(self, corners: FloatArray, face: IndexArray, column: IndexArray) -> FloatArray:
         """(3, 3, m) corners (corner, axis, pair) of faces in the sensor's frame at the columns' times.
 
         corners: (3, 3, n) of all faces (corner, axis, face) in its frame at the stamp [m].
         """
-        moving = np.any(self.velocities, axis=(1, 2))
-        at = corners[:, :, face]
-        pairs = np.flatnonzero(moving[face])
+        at = corners.take(face, axis=2)
+        pairs = np.flatnonzero(self.moving[face])
         if len(pairs):
             speed = self.velocities[face[pairs]].transpose(1, 2, 0)
             at[:, :, pairs] += speed * self.seconds[column[pairs]]
-        at -= self.positions.T[:, column]
+        at -= self.positions.T.take(column, axis=1)
         # p = R^T (w - t), written out: rows of R^T are columns of R.
-        turn = self.rotations.transpose(1, 2, 0)[:, :, column]
+        turn = self.rotations.transpose(1, 2, 0).take(column, axis=2)
         return np.stack(
             [at[:, 0] * turn[0, k] + at[:, 1] * turn[1, k] + at[:, 2] * turn[2, k] for k in range(3)], axis=1
         )
 
+    @cached_property
     def reach(self) -> tuple[FloatArray, float]:
         """Bounds: (n,) displacement of each face relative to the sensor [m], the sensor's rotation [rad]."""
         half = float(np.abs(self.seconds).max())
@@ -93,48 +99,74 @@ def cast_lidar(
     ``shifts``: a turn of all columns [rad], small against their step. With ``motion`` each column
     sees the world at its own instant.
     """
-    corners = np.ascontiguousarray(triangles.transpose(1, 2, 0))
+    below = np.arange(len(triangles)) if motion is not None else _not_above(triangles, columns.slopes)
+    corners = np.ascontiguousarray(triangles.take(below, axis=0).transpose(1, 2, 0))
     normal = _normals(corners)
     d = (normal * corners[0]).sum(axis=0)
     size = np.maximum(np.sqrt((normal**2).sum(axis=0)), 1e-12)
-    slack: FloatArray | float = 0.0 if motion is None else motion.reach()[0]
+    slack: FloatArray | float = 0.0 if motion is None else motion.reach[0]
     kept = np.flatnonzero(d / size < slack)
     face, column = _candidate_pairs(corners, kept, columns, max(abs(shift) for shift in shifts), motion)
-    if motion is None:
-        at, n, dd = corners[:, :, face], normal[:, face], d[face]
-    else:
-        at = motion.seen(corners, face, column)
-        n = _normals(at)
-        dd = (n * at[0]).sum(axis=0)
-    front = np.flatnonzero(dd < 0.0)
-    at, n, face, column = at[:, :, front], n[:, front] / dd[front], face[front], column[front]
-    azimuths = columns.azimuths
-    return [_cast_beam(at, n, face, column, azimuths + shift, columns.slopes) for shift in shifts]
+    planes = normal / np.where(d < 0.0, d, -1.0)
+    beams = [_Beam(columns.azimuths + shift, columns.slopes) for shift in shifts]
+    for begin in range(0, len(face), AT_ONCE):
+        some, by = face[begin : begin + AT_ONCE], column[begin : begin + AT_ONCE]
+        if motion is None:  # all that was kept is seen from its front
+            at, n = corners.take(some, axis=2), planes.take(some, axis=1)
+        else:
+            at = motion.seen(corners, some, by)
+            n = _normals(at)
+            dd = (n * at[0]).sum(axis=0)
+            front = np.flatnonzero(dd < 0.0)
+            at, n = at.take(front, axis=2), n.take(front, axis=1) / dd[front]
+            some, by = some[front], by[front]
+        for beam in beams:
+            beam.add(at, n, below[some], by)
+    return [beam.nearest() for beam in beams]
 
 
-def _cast_beam(
-    at: FloatArray,
-    n: FloatArray,
-    face: IndexArray,
-    column: IndexArray,
-    azimuths: FloatArray,
-    slopes: FloatArray,
-) -> tuple[IndexArray, FloatArray]:
-    """Nearest faces from pairs: corners (3, 3, m), planes n . p = 1 (3, m), faces and columns (m,)."""
-    cos, sin = np.cos(azimuths)[column], np.sin(azimuths)[column]
-    low, high = _column_cuts(at, cos, sin)
-    first, last = np.searchsorted(slopes, low), np.searchsorted(slopes, high)
-    hit = np.flatnonzero(last > first)
-    pair, step = runs((last - first)[hit])
-    pair = hit[pair]
-    ring = first[pair] + step
-    # 1/r = n . [cos sin slope] with r the horizontal range.
-    level = n[0] * cos + n[1] * sin
-    inverse = level[pair] + n[2][pair] * slopes[ring]
-    shape = (len(slopes), len(azimuths))
-    best, closeness = nearest_faces(shape[0] * shape[1], ring * shape[1] + column[pair], inverse, face[pair])
-    reach = np.where(best >= 0, 1.0 / np.maximum(closeness, 1e-9), np.inf)
-    return best.reshape(shape), reach.reshape(shape)
+class _Beam:
+    """What the rays of one firing direction a column hit, collected from pairs of faces and columns."""
+
+    def __init__(self, azimuths: FloatArray, slopes: FloatArray) -> None:
+        self.cos, self.sin, self.slopes = np.cos(azimuths), np.sin(azimuths), slopes
+        self.hits: list[tuple[IndexArray, FloatArray, IndexArray]] = []
+
+    def add(self, at: FloatArray, n: FloatArray, face: IndexArray, column: IndexArray) -> None:
+        """Pairs: corners (3, 3, m), planes n . p = 1 (3, m), faces and columns (m,)."""
+        cos, sin = self.cos[column], self.sin[column]
+        low, high = _column_cuts(at, cos, sin)
+        first, last = np.searchsorted(self.slopes, low), np.searchsorted(self.slopes, high)
+        hit = np.flatnonzero(last > first)
+        pair, step = runs((last - first)[hit])
+        pair = hit[pair]
+        ring = first[pair] + step
+        # 1/r = n . [cos sin slope] with r the horizontal range.
+        level = n[0] * cos + n[1] * sin
+        inverse = level[pair] + n[2][pair] * self.slopes[ring]
+        self.hits.append((ring * len(self.cos) + column[pair], inverse, face[pair]))
+
+    def nearest(self) -> tuple[IndexArray, FloatArray]:
+        """Nearest face (r, count) along every ray (-1: none), and its horizontal range [m] (inf: none)."""
+        shape = (len(self.slopes), len(self.cos))
+        none = (np.zeros(0, np.intp), np.zeros(0), np.zeros(0, np.intp))
+        ray, inverse, face = (np.concatenate(parts) for parts in zip(*(self.hits or [none]), strict=True))
+        best, closeness = nearest_faces(shape[0] * shape[1], ray, inverse, face)
+        reach = np.where(best >= 0, 1.0 / np.maximum(closeness, 1e-9), np.inf)
+        return best.reshape(shape), reach.reshape(shape)
+
+
+def _not_above(triangles: FloatArray, slopes: FloatArray) -> IndexArray:
+    """Those of the triangles (n, 3, 3) that are not wholly above all rings."""
+    bottom = _of_three(np.minimum, triangles[:, :, 2])
+    far = _of_three(np.maximum, np.hypot(triangles[:, :, 0], triangles[:, :, 1]))
+    # A little less strict than the quotient of :func:`_within_rings`, which decides.
+    return np.flatnonzero((bottom < 0.0) | (bottom <= slopes[-1] * far * (1.0 + 1e-9)))
+
+
+def _of_three(choice: np.ufunc, values: FloatArray) -> FloatArray:
+    """(n,) least or greatest of each row of ``values`` (n, 3)."""
+    return np.asarray(choice(choice(values[:, 0], values[:, 1]), values[:, 2]))
 
 
 def _normals(corners: FloatArray) -> FloatArray:
@@ -147,12 +179,12 @@ def _candidate_pairs(
     corners: FloatArray, kept: IndexArray, columns: Columns, widen: float, motion: SweepMotion | None
 ) -> tuple[IndexArray, IndexArray]:
     """All pairs (face, column) of the faces ``kept`` whose half-plane may cut the face."""
-    start, low, high, distance, _ = _extent(corners[:, :, kept])
+    seen = corners.take(kept, axis=2)
+    start, low, high, distance = _extent(seen)
     pad: FloatArray | float = 0.0
     shift: FloatArray | float = 0.0
-    seen = corners[:, :, kept]
     if motion is not None:
-        reach, turn = motion.reach()
+        reach, turn = motion.reach
         reach = reach[kept]
         wide = turn + np.arcsin(np.minimum(reach / distance, 1.0))
         # Look again at the time at which the beam passes; what moves from then on is less by the
@@ -161,7 +193,7 @@ def _candidate_pairs(
         for _ in range(2):
             column = np.rint((middle - columns.azimuth0) / columns.step).astype(np.intp) % columns.count
             seen = motion.seen(corners, kept, column)
-            start, low, high, distance, _ = _extent(seen)
+            start, low, high, distance = _extent(seen)
             shift, middle = middle, np.mod(start + 0.5 * (low + high) + np.pi, 2 * np.pi) - np.pi
         share = np.minimum(2.0 * ((high - low) + np.abs(middle - shift)) / np.pi + 0.03, 2.0)
         from_cut = np.abs(np.mod(middle - motion.cut + np.pi, 2 * np.pi) - np.pi)
@@ -177,9 +209,9 @@ def _candidate_pairs(
     return kept[face], (first[face].astype(np.intp) + offset) % columns.count
 
 
-def _extent(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+def _extent(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Of triangles (3, 3, n): azimuth of the first corner, least and greatest turn from it [rad],
-    horizontal distance of the z axis from the outline, and that of the farthest corner [m]."""
+    horizontal distance of the z axis from the outline [m]."""
     x, y = corners[:, 0], corners[:, 1]
     azimuth = np.arctan2(y, x)
     turn = np.mod(azimuth[1:] - azimuth[:1] + np.pi, 2 * np.pi) - np.pi
@@ -189,7 +221,7 @@ def _extent(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, Fl
         dx, dy = x[b] - x[a], y[b] - y[a]
         t = np.clip(-(x[a] * dx + y[a] * dy) / np.maximum(dx**2 + dy**2, 1e-12), 0.0, 1.0)
         nearest = np.minimum(nearest, np.hypot(x[a] + t * dx, y[a] + t * dy))
-    return azimuth[0], low, high, np.maximum(nearest, 1e-6), np.hypot(x, y).max(axis=0)
+    return azimuth[0], low, high, np.maximum(nearest, 1e-6)
 
 
 def _within_rings(
@@ -212,24 +244,29 @@ def _column_cuts(corners: FloatArray, cos: FloatArray, sin: FloatArray) -> tuple
     """
     x, y, z = corners[:, 0], corners[:, 1], corners[:, 2]
     side, along = cos * y - sin * x, cos * x + sin * y
-    low, high = np.full(len(cos), np.inf), np.full(len(cos), -np.inf)
-    hits = np.zeros(len(cos), np.int8)
-    for i, j in ((0, 1), (1, 2), (2, 0)):
-        pairs = np.flatnonzero((side[i] <= 0.0) != (side[j] <= 0.0))
-        # From the right-hand corner to the left-hand one, the same for both triangles at an edge.
-        s0, s1 = side[i][pairs], side[j][pairs]
-        r0, r1, z0, z1 = along[i][pairs], along[j][pairs], z[i][pairs], z[j][pairs]
-        swap = s0 > s1
-        s0, s1 = np.where(swap, s1, s0), np.where(swap, s0, s1)
-        r0, r1 = np.where(swap, r1, r0), np.where(swap, r0, r1)
-        z0, z1 = np.where(swap, z1, z0), np.where(swap, z0, z1)
-        t = s0 / (s0 - s1)
-        reach = r0 + t * (r1 - r0)
-        ahead = reach > 1e-9
-        pairs, slope = pairs[ahead], ((z0 + t * (z1 - z0))[ahead] / reach[ahead])
-        low[pairs] = np.minimum(low[pairs], slope)
-        high[pairs] = np.maximum(high[pairs], slope)
-        hits[pairs] += 1
-    once = hits == 1
-    below = z.mean(axis=0) < 0.0
-    return np.where(once & below, -np.inf, low), np.where(once & ~below, np.inf, high)
+    count = len(cos)
+    low, high = np.full(count, np.inf), np.full(count, -np.inf)
+    right = side <= 0.0
+    pairs = np.flatnonzero((right[0] != right[1]) | (right[0] != right[2]))
+    # One corner is on the other side than two: its edges are cut, from the right-hand corner to the left-hand
+    # one, the same for both triangles at an edge.
+    right = right.take(pairs, axis=1)
+    odd = np.where(right[0] == right[1], 2, np.where(right[0] == right[2], 1, 0))
+    odd_is_right = right[odd, np.arange(len(pairs))]
+    slopes, cut = np.empty((2, len(pairs))), np.empty((2, len(pairs)), np.bool_)
+    for k in (0, 1):
+        a, b = odd * count + pairs, (odd + 1 + k) % 3 * count + pairs
+        a, b = np.where(odd_is_right, a, b), np.where(odd_is_right, b, a)
+        s, r, h = side.take(a), along.take(a), z.take(a)
+        t = s / (s - side.take(b))
+        reach = r + t * (along.take(b) - r)
+        cut[k] = reach > 1e-9
+        slopes[k] = (h + t * (z.take(b) - h)) / np.where(cut[k], reach, 1.0)
+    low[pairs] = np.where(cut, slopes, np.inf).min(axis=0)
+    high[pairs] = np.where(cut, slopes, -np.inf).max(axis=0)
+    once = cut[0] != cut[1]
+    if once.any():
+        pierced = pairs[once]
+        below = z[:, pierced].mean(axis=0) < 0.0
+        low[pierced[below]], high[pierced[~below]] = -np.inf, np.inf
+    return low, high

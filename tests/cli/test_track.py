@@ -22,6 +22,8 @@ from stored import written
 from sst_graph.cli import main
 from sst_graph.result import read_result
 
+AT_ONCE = ["--sweep", "compensated"]
+"""Where it does not matter: deciding it takes longer than what is tested."""
 SOON = [word for setting in streets.SOON for word in ("--set", setting)]
 
 
@@ -141,7 +143,8 @@ def test_resumed_on_other_frames_or_settings(
 ) -> None:
     """Refused in one line before a frame is taken; the checkpoint stays as it is."""
     before = saved.read_bytes()
-    assert main(["track", str(street), *options, "--checkpoint", str(saved), "--resume"]) == 2
+    command = ["track", str(street), *AT_ONCE, "--checkpoint", str(saved), "--resume"]
+    assert main([*command, *options]) == 2
     captured = capsys.readouterr()
     assert captured.out == "" and captured.err.count("\n") == 1 and message in captured.err
     assert saved.read_bytes() == before
@@ -158,7 +161,7 @@ def test_resumed_on_another_drive(
         points = np.fromfile(path, "<f4")
         points[0] += 0.01
         points.tofile(path)
-        assert main(["track", str(other), "--checkpoint", str(saved), "--resume"]) == 2
+        assert main(["track", str(other), *AT_ONCE, "--checkpoint", str(saved), "--resume"]) == 2
         captured = capsys.readouterr()
         assert captured.out == "" and "another drive (another scan of" in captured.err
 
@@ -208,7 +211,7 @@ def unlabelled(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return bare.parents[1]
 
 
-@pytest.mark.parametrize("options", [[], ["--method", "auto"], ["--method", "edges"]])
+@pytest.mark.parametrize("options", [[], ["--method", "auto", *AT_ONCE], ["--method", "edges", *AT_ONCE]])
 def test_a_drive_without_labels_is_tracked_by_edges(
     unlabelled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str]
 ) -> None:

@@ -26,10 +26,10 @@ from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.mask_shift import contour_profiles, mask_shift
 from sst_graph.inspect.reasons import short_reason
-from sst_graph.odometry.sweep import SweepDecision
+from sst_graph.odometry.sweep import SweepDecision, SweptSource, with_sweep
 from sst_graph.simulator import SimulationConfig
 from sst_graph.sweep_timing import SweepTiming
-from sst_graph.types import NO_PICTURE, Guess, Scan, SemanticClass
+from sst_graph.types import NO_PICTURE, Guess, Scan, SemanticClass, Source
 from studies.subtle_faults import SUBTLE_FAULTS, SUBTLE_NAMED, repeated_pictures
 from studies.wrong_drives import INPUT_FAULTS, NAMED, shifted_masks
 
@@ -83,8 +83,28 @@ def other() -> KeptDrive:
     return street(32, 10)
 
 
+@cache
+def decision() -> SweepDecision:
+    """What is decided of the drive's sweep."""
+    return with_sweep(drive()).sweep_decision
+
+
+def swept(data: KeptDrive) -> Source:
+    """The data; where their scans are the drive's own, with what was decided of these."""
+
+    def same(a: Scan | None, b: Scan | None) -> bool:
+        return a is b or (
+            a is not None
+            and b is not None
+            and (a.stamp_ns, id(a.points), id(a.classes)) == (b.stamp_ns, id(b.points), id(b.classes))
+        )
+
+    own = len(data) == len(drive()) and all(same(a.scan, b.scan) for a, b in zip(data, drive(), strict=True))
+    return SweptSource(data, decision()) if own else data
+
+
 def causes(data: KeptDrive) -> list[str]:
-    drives = prepare_drives([data], CalibrationConfig())
+    drives = prepare_drives([swept(data)], CalibrationConfig())
     return [finding.sentence for finding in preflight(drives, data.nominal, CLASSES)]
 
 
@@ -130,7 +150,7 @@ def test_frames_without_content_are_no_repeated_ones() -> None:
 
 @cache
 def prepared() -> Drive:
-    (one,) = prepare_drives([drive()], CalibrationConfig())
+    (one,) = prepare_drives([swept(drive())], CalibrationConfig())
     return one
 
 
@@ -227,7 +247,7 @@ def test_checks_that_run_only_where_a_result_is_not_ok(fault: str) -> None:
 
 def test_without_the_search_for_causes_only_the_reasons_remain() -> None:
     wrong = INPUT_FAULTS["Tr inverted"](drive(), other())
-    result = calibrate(wrong, wrong.nominal, CalibrationConfig(find_causes=False))
+    result = calibrate(swept(wrong), wrong.nominal, CalibrationConfig(find_causes=False))
     assert result.status != "ok" and not any("inverted" in reason for reason in result.reasons)
 
 

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stored import written
+from stored import simulated, written
+from streets import SHORT_STREET
 
 from sst_graph.cli import main
 from sst_graph.data import open_source
@@ -48,13 +49,32 @@ def networks(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def unlabelled(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The street on disk without labels and masks."""
-    folder = tmp_path_factory.mktemp("drive") / "street"
-    shutil.copytree(written(STREET), folder)
+def rough_networks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same fitted in a few steps to two frames, where it does not matter what they find."""
+    folder, street = tmp_path_factory.mktemp("networks"), simulated(SHORT_STREET)
+    few = KeptDrive(street.name, street.camera, street.nominal, street.truth, (street[0], street[10]))
+    write_image_network([few], folder, Fit(pixels=500, steps=20))
+    write_scan_network([few], folder, Fit(pixels=500, steps=20))
+    return folder
+
+
+def without_labels(street: Path, folder: Path) -> Path:
+    """A copy of a street on disk without labels and masks."""
+    shutil.copytree(street, folder)
     for name in ("labels", "semantic_2"):
         shutil.rmtree(folder / "sequences" / "00" / name)
     return folder
+
+
+@pytest.fixture(scope="module")
+def unlabelled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return without_labels(written(STREET), tmp_path_factory.mktemp("drive") / "street")
+
+
+@pytest.fixture(scope="module")
+def small_unlabelled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A street in smaller pictures, for the rough networks."""
+    return without_labels(written(SHORT_STREET), tmp_path_factory.mktemp("drive") / "street")
 
 
 def overlap(found: np.ndarray, exact: np.ndarray) -> float:
@@ -119,18 +139,23 @@ def test_a_drive_without_labels_is_calibrated_by_networks(
 
 
 def test_tracking_labels_frame_by_frame(
-    networks: Path, unlabelled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    rough_networks: Path, small_unlabelled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    models = ["--image-model", str(networks / "image.yaml"), "--lidar-model", str(networks / "scan.yaml")]
-    main(["track", str(unlabelled), "--frames", "0:4", *models, "--labels", str(tmp_path / "labels")])
+    models = [
+        "--image-model",
+        str(rough_networks / "image.yaml"),
+        "--lidar-model",
+        str(rough_networks / "scan.yaml"),
+    ]
+    main(["track", str(small_unlabelled), "--frames", "0:4", *models, "--labels", str(tmp_path / "labels")])
     assert len(capsys.readouterr().out.splitlines()) == 4
     assert len(list((tmp_path / "labels").glob("*/*/*.*"))) == 4 + 4 + 2
 
 
 def test_classes_that_a_network_does_not_know_are_refused(
-    networks: Path, unlabelled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    rough_networks: Path, small_unlabelled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["calibrate", str(unlabelled), "--image-model", str(networks / "image.yaml")]
+    command = ["calibrate", str(small_unlabelled), "--image-model", str(rough_networks / "image.yaml")]
     command += ["--labels", str(tmp_path / "labels"), "--method", "joint", "--out", str(tmp_path / "out")]
     assert main([*command, "--classes", "vehicle,pole"]) == 2
     message = capsys.readouterr().err
@@ -139,19 +164,19 @@ def test_classes_that_a_network_does_not_know_are_refused(
 
 
 def test_labels_are_not_written_among_other_things(
-    networks: Path, unlabelled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    rough_networks: Path, small_unlabelled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["segment", str(unlabelled), "--image-model", str(networks / "image.yaml"), "--out"]
+    command = ["segment", str(small_unlabelled), "--image-model", str(rough_networks / "image.yaml"), "--out"]
     other = tmp_path / "other"
     other.mkdir()
     (other / "notes.txt").write_text("mine")
     for folder, message in (
         (other, "found a folder of other things, expected a new one or one of labels"),
         (other / "notes.txt", "found a file, expected a folder or nothing"),
-        (unlabelled, "is read as DATA and would be replaced"),
+        (small_unlabelled, "is read as DATA and would be replaced"),
     ):
         assert main([*command, str(folder)]) == 2
         assert message in capsys.readouterr().err
     assert os.listdir(other) == ["notes.txt"]
-    assert main(["segment", str(unlabelled), "--out", str(tmp_path / "new")]) == 2
+    assert main(["segment", str(small_unlabelled), "--out", str(tmp_path / "new")]) == 2
     assert "found neither --image-model nor --lidar-model" in capsys.readouterr().err

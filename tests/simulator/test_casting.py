@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from sst_graph.factors.camera import PinholeCamera
+from sst_graph.simulator.camera.render import View
 from sst_graph.simulator.casting import cast_image, clip_near, compact, plane_of
 from sst_graph.simulator.sweep import Columns, SweepMotion, cast_lidar
 from sst_graph.types import FloatArray
@@ -51,6 +53,31 @@ def test_image_agrees_with_brute_force() -> None:
     np.testing.assert_array_equal(faces.ravel()[clear], expected[clear])
     found = clear & (expected >= 0)
     np.testing.assert_allclose(depth.ravel()[found], s[found], rtol=2e-6)
+
+
+def test_all_that_is_in_the_picture_is_in_sight() -> None:
+    rng = np.random.default_rng(6)
+    triangles = soup(rng, rng.uniform(-15.0, 15.0, (2000, 3)), 1.3)
+    for rotation in Rotation.random(8, random_state=rng).as_matrix():
+        view = View(CAMERA, rotation, rng.normal(size=3))
+        faces, depth = cast_image(view.to_camera(triangles), CAMERA)
+        seen = view.in_sight(triangles)
+        assert set(faces[faces >= 0]) <= set(seen) and len(seen) < 0.5 * len(triangles)
+        again, same_depth = cast_image(view.to_camera(triangles[seen]), CAMERA)
+        np.testing.assert_array_equal(np.append(seen, -1)[again], faces)
+        np.testing.assert_array_equal(same_depth, depth)
+
+
+def test_faces_above_all_rings_change_nothing() -> None:
+    """They are left out before anything is cut; those beside the rings' highest are not."""
+    rng = np.random.default_rng(7)
+    world = lidar_world(rng)
+    high = soup(rng, np.column_stack([rng.uniform(-9.0, 9.0, (50, 2)), rng.uniform(9.0, 12.0, 50)]), 0.5)
+    (faces, reach), (with_them, same_reach) = (
+        cast_lidar(triangles, COLUMNS)[0] for triangles in (world, np.concatenate([high, world]))
+    )
+    np.testing.assert_array_equal(with_them, np.where(faces >= 0, faces + len(high), -1))
+    np.testing.assert_array_equal(same_reach, reach)
 
 
 def lidar_world(rng: np.random.Generator) -> FloatArray:

@@ -13,6 +13,8 @@ import pytest
 
 from sst_graph.errors import ConfigError
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
+from sst_graph.simulator.mesh import extended, merged
+from sst_graph.simulator.vehicles import random_car
 from sst_graph.types import CameraImage, GroundTruth, Scan, SemanticClass, Source
 
 SMALL: dict[str, Any] = {
@@ -220,3 +222,13 @@ def test_bad_configurations_are_refused(name: str, value: Any) -> None:
 def test_drives_that_would_fill_the_memory_are_refused(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         SimulationConfig(**settings)
+
+
+def test_a_mesh_is_extended_by_others_behind_its_own_faces() -> None:
+    rng = np.random.default_rng(4)
+    whole, one, two = (random_car(rng) for _ in range(3))
+    pick = np.array([7, 2, 30])
+    for more in ([], [one, two]):
+        found, expected = extended(whole, pick, more), merged([whole.part(pick), *more])
+        for name in ("triangles", "kinds", "materials", "colours", "textures"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))

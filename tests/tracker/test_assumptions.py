@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from stored import simulated
+from streets import TRACKED_STREET
 
 from sst_graph import Tracker, TrackerConfig
 from sst_graph.assumptions import ASSUMPTIONS, held_at_zero
@@ -27,7 +28,6 @@ from sst_graph.graph.matching import Tracks
 from sst_graph.graph.outer_loop import JointProblem, solve_joint
 from sst_graph.graph.state import State, nuisance_key
 from sst_graph.objects.tracks import object_tracks
-from sst_graph.simulator import SimulationConfig
 from sst_graph.tracker.make_update import current_update
 from sst_graph.tracker.sums.running_sums import RunningSums
 from sst_graph.tracker.window.gaussian import Gaussian, Point
@@ -45,19 +45,10 @@ def _config(*settings: str) -> TrackerConfig:
 
 @pytest.fixture(scope="module")
 def street() -> KeptDrive:
-    """Many vehicles, half-size pictures."""
-    config = SimulationConfig(
-        seed=5,
-        frames=24,
-        width=621,
-        height=188,
-        azimuth_limit_deg=50.0,
-        azimuth_step_deg=0.3,
-        vehicle_density=0.3,
-        time_offset_s=0.04,
-        speed_mps=6.0,
-    )
-    return KeptDrive.of(simulated(config))
+    """The first frames of the street that trackers are tried on."""
+    drive = simulated(TRACKED_STREET)
+    frames = tuple(drive[position] for position in range(24))
+    return KeptDrive(drive.name, drive.camera, drive.nominal, drive.truth, frames, drive.sweep)
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +59,7 @@ def distorted(street: KeptDrive) -> KeptDrive:
 
 def _tracked(drive: KeptDrive, *settings: str, optimize: bool = True) -> Tracker:
     assert drive.truth is not None
-    tracker = Tracker(drive.camera, _config(*settings), drive.truth.cTl, 0.04)
+    tracker = Tracker(drive.camera, _config(*settings), drive.truth.cTl, 0.03)
     for frame in drive:
         tracker.add(frame)
     if optimize:
@@ -262,7 +253,7 @@ def test_what_is_estimated_agrees_with_the_batch(
         config.joint,
         graph=dataclasses.replace(config.noise, lower_edges=estimating.matcher.graph.lower_edges),
     )
-    start = State(distorted.truth.cTl, (0.04,))
+    start = State(distorted.truth.cTl, (0.03,))
     solution = solve_joint(JointProblem([drive], Tracks([drive], [tracks]), joint), start)
     robust = robust_covariance(solution.graph, solution.values, solution.pairs, solution.state, [tracks])
     state, column = solution.state, robust.unknowns.column(nuisance_key("k1"))

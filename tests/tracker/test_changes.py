@@ -9,12 +9,21 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
-from streets import EARLY_START, knocked, sigmas_apart, tracker_from_truth, turned
+from stored import simulated, stored
+from streets import (
+    EARLY_START,
+    TRACKED_STREET,
+    checkpoint_of,
+    knocked,
+    sigmas_apart,
+    tracker_from_truth,
+    turned,
+)
 
 from sst_graph import Tracker
 from sst_graph.covariance.observability import ObservabilityConfig
 from sst_graph.simulator import SimulatedDrive
-from sst_graph.tracker.config import AlarmConfig, DriftConfig
+from sst_graph.tracker.config import AlarmConfig, DriftConfig, TrackerConfig
 from sst_graph.tracker.history import HistoryEntry
 from sst_graph.tracker.make_update import current_update
 from sst_graph.tracker.track_update import TrackUpdate
@@ -32,6 +41,23 @@ BY_LABELS = AlarmConfig(stamps=False)
 def _warmed_up(tracker: Tracker) -> Tracker:
     """The same, whose start counts as over soon: a contradiction is an alarm from then on."""
     tracker.monitor.changes.warm_up_scans = 4
+    return tracker
+
+
+def _at_step(config: TrackerConfig, folder: Path, warmed_up: bool = False) -> Tracker:
+    """A tracker that has seen the frames before the step and raised no alarm, from its checkpoint."""
+    prepare = _warmed_up if warmed_up else lambda tracker: tracker
+
+    def make() -> bytes:
+        drive = simulated(TRACKED_STREET)
+        tracker = prepare(tracker_from_truth(drive, config))
+        assert not any(tracker.add(drive[position]).alarm for position in range(STEP))
+        return checkpoint_of(tracker)
+
+    path = folder / "at_step.npz"
+    path.write_bytes(stored((TRACKED_STREET, config, warmed_up, STEP), make))
+    tracker = prepare(Tracker.load(path))
+    tracker.initializer.work_per_frame = None
     return tracker
 
 
@@ -63,24 +89,23 @@ def test_a_step_raises_the_alarm_and_is_estimated(
         assert np.degrees(np.linalg.norm(off)) < 0.6
 
 
-def jumped(tracker: Tracker, frames: list[Frame], jump_ms: int) -> list[TrackUpdate]:
-    """Answers to the frames from the step on, whose images have other stamps."""
+def jumped(folder: Path, frames: list[Frame], jump_ms: int) -> tuple[Tracker, list[TrackUpdate]]:
+    """A tracker after frames whose images have other stamps from the step on, and its answers to these."""
+    tracker = _at_step(dataclasses.replace(EARLY_START, alarm=BY_LABELS), folder, warmed_up=True)
     updates = []
-    for frame in frames:
+    for frame in frames[STEP:]:
         assert frame.image is not None
-        late = jump_ms * 1_000_000 if frame.index >= STEP else 0
-        image = dataclasses.replace(frame.image, stamp_ns=frame.image.stamp_ns + late)
+        image = dataclasses.replace(frame.image, stamp_ns=frame.image.stamp_ns + jump_ms * 1_000_000)
         updates.append(tracker.add(dataclasses.replace(frame, image=image)))
-    return updates[STEP:]
+    return tracker, updates
 
 
 @pytest.mark.parametrize("jump_ms", [-40, 40])
 def test_a_jump_in_the_first_seconds_raises_the_alarm(
-    street: SimulatedDrive, frames: list[Frame], jump_ms: int
+    street: SimulatedDrive, frames: list[Frame], tmp_path: Path, jump_ms: int
 ) -> None:
     """Soon after the start: noticed by the labels within ten frames, though the estimate follows."""
-    tracker = _warmed_up(tracker_from_truth(street, dataclasses.replace(EARLY_START, alarm=BY_LABELS)))
-    updates = jumped(tracker, frames[: STEP + 14], jump_ms)
+    tracker, updates = jumped(tmp_path, frames[: STEP + 14], jump_ms)
     alarms = [i for i, update in enumerate(updates) if update.alarm]
     assert len(alarms) == 1 and alarms[0] < 10
     assert tracker.estimate.exists and tracker.monitor.changes.reference is None
@@ -89,38 +114,33 @@ def test_a_jump_in_the_first_seconds_raises_the_alarm(
 
 @pytest.mark.parametrize("jump_ms", [-30, 30])
 def test_a_smaller_jump_in_the_first_seconds_is_not_silent(
-    street: SimulatedDrive, frames: list[Frame], jump_ms: int
+    frames: list[Frame], tmp_path: Path, jump_ms: int
 ) -> None:
     """With one object left out the others may show too little for an alarm so early: it is suspected then."""
-    tracker = _warmed_up(tracker_from_truth(street, dataclasses.replace(EARLY_START, alarm=BY_LABELS)))
-    alarm = [
-        update.alarm or bool(update.suspected_change)
-        for update in jumped(tracker, frames[: STEP + 10], jump_ms)
-    ]
-    assert any(alarm)
+    _, updates = jumped(tmp_path, frames[: STEP + 10], jump_ms)
+    assert any(update.alarm or update.suspected_change for update in updates)
 
 
 @pytest.mark.parametrize(
     ("sensor", "jump_ms"), [("image", -30), ("image", 30), ("scan", 30), ("image", -200)]
 )
 def test_stamps_that_jump_against_their_interval_are_an_alarm(
-    street: SimulatedDrive, frames: list[Frame], sensor: str, jump_ms: int
+    frames: list[Frame], tmp_path: Path, sensor: str, jump_ms: int
 ) -> None:
     """Noticed within six frames though nothing in view shows it; estimated from what comes into view."""
-    tracker, updates = tracker_from_truth(street, EARLY_START), []
-    for frame in frames:
+    tracker, updates = _at_step(EARLY_START, tmp_path), []
+    for frame in frames[STEP:]:
         assert frame.image is not None and frame.scan is not None
-        image, scan = frame.image, frame.scan
-        late = jump_ms * 1_000_000 if frame.index >= STEP else 0
+        image, scan, late = frame.image, frame.scan, jump_ms * 1_000_000
         if sensor == "image":
             image = dataclasses.replace(image, stamp_ns=image.stamp_ns + late)
         else:
             scan = dataclasses.replace(scan, stamp_ns=scan.stamp_ns + late)
-        if STEP <= frame.index < STEP + 6:
+        if frame.index < STEP + 6:
             image = dataclasses.replace(image, mask=np.full_like(image.mask, SemanticClass.IGNORE))
         updates.append(tracker.add(dataclasses.replace(frame, image=image, scan=scan)))
     alarms = [i for i, update in enumerate(updates) if update.alarm]
-    assert len(alarms) == 1 and STEP <= alarms[0] < STEP + 6
+    assert len(alarms) == 1 and alarms[0] < 6
     alarm = updates[alarms[0]]
     assert f"{sensor} stamps jumped" in alarm.reason and alarm.status == "alarm"
     assert alarm.chi2 is not None and alarm.chi2 > tracker.setup.config.alarm.chi2
@@ -147,14 +167,15 @@ def test_a_jump_before_the_start_empties_the_window(street: SimulatedDrive, fram
     assert len(tracker.inputs.window.images) == 5
 
 
-def test_a_knock_beyond_all_matches_is_a_step_too(street: SimulatedDrive, frames: list[Frame]) -> None:
+def test_a_knock_beyond_all_matches_is_a_step_too(
+    street: SimulatedDrive, frames: list[Frame], tmp_path: Path
+) -> None:
     """The camera nods by 10 degrees: next to nothing meets the labels; it is looked for all around."""
-    tracker = tracker_from_truth(street)
+    tracker = _at_step(EARLY_START, tmp_path)
     R, alarms = gtsam.Rot3.Rx(np.radians(10.0)), []
-    for frame in frames:
+    for frame in frames[STEP:]:
         assert frame.image is not None
-        later = frame.index >= STEP
-        image = turned(frame.image, street, R, borderValue=255) if later else frame.image
+        image = turned(frame.image, street, R, borderValue=255)
         alarms += [frame.index] if tracker.add(dataclasses.replace(frame, image=image)).alarm else []
     assert len(alarms) == 1 and STEP <= alarms[0] < STEP + 10
     assert tracker.initializer.guess.search and tracker.estimate.exists

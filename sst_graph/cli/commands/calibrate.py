@@ -14,14 +14,8 @@ from sst_graph.batch.by_edges.choice import with_method_for
 from sst_graph.cli.inputs import calibration_settings, open_drives, starting_point
 from sst_graph.cli.labels import check_classes
 from sst_graph.cli.messages import complain, mention, say
-from sst_graph.cli.outputs import (
-    CALIBRATION,
-    check_apart,
-    comparison,
-    exit_code,
-    result_numbers,
-    write_calibration,
-)
+from sst_graph.cli.output_places import check_apart
+from sst_graph.cli.outputs import CALIBRATION, comparison, exit_code, result_numbers, write_calibration
 from sst_graph.cli.progress import ProgressBar
 from sst_graph.cli.reading import options_of, warn_of_other_pairs, with_image_topic
 from sst_graph.cli.rig import given_cameras, refuse_rig_options, run_rig

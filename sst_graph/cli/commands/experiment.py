@@ -11,7 +11,7 @@ from pathlib import Path
 import sst_graph
 from sst_graph.cli.inputs import settings
 from sst_graph.cli.messages import mention, say
-from sst_graph.cli.outputs import check_apart
+from sst_graph.cli.output_places import check_apart
 from sst_graph.cli.progress import ProgressBar
 from sst_graph.errors import ConfigError
 from sst_graph.experiments.paper.config import PaperTableConfig

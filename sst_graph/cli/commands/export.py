@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from sst_graph.cli.messages import complain, loudness, mention, say
-from sst_graph.cli.outputs import check_apart
+from sst_graph.cli.output_places import check_apart
 from sst_graph.data.kitti.calib import read_calibration
 from sst_graph.errors import ConfigError
 from sst_graph.export import ExportOptions, export_text

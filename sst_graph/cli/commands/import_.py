@@ -6,7 +6,7 @@ import argparse
 from typing import Any
 
 from sst_graph.cli.messages import complain, mention, say
-from sst_graph.cli.outputs import check_apart
+from sst_graph.cli.output_places import check_apart
 from sst_graph.files import output_file
 from sst_graph.files.strict_json import strict_json
 from sst_graph.imports import ImportedCalibration, ImportOptions, import_calibration, read_tree

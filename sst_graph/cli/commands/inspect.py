@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 from sst_graph.cli.messages import say
-from sst_graph.cli.outputs import check_apart
+from sst_graph.cli.output_places import check_apart
 from sst_graph.cli.reading import reading_words
 from sst_graph.errors import ConfigError
 from sst_graph.files import OutputKind, atomic_directory

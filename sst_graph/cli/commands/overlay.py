@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from sst_graph.cli.messages import mention
-from sst_graph.cli.outputs import PNG_FILE, check_apart
+from sst_graph.cli.output_places import PNG_FILE, check_apart
 from sst_graph.cli.pictures import ShownFrame, overlay, png, position_of
 from sst_graph.cli.progress import ProgressBar
 from sst_graph.cli.reading import open_drive_of

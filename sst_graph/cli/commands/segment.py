@@ -6,7 +6,7 @@ import argparse
 
 from sst_graph.cli.labels import image_segmenter, scan_segmenter, store_to_fill
 from sst_graph.cli.messages import mention
-from sst_graph.cli.outputs import check_apart
+from sst_graph.cli.output_places import check_apart
 from sst_graph.cli.progress import ProgressBar
 from sst_graph.cli.reading import open_drive
 from sst_graph.errors import ConfigError, count_of

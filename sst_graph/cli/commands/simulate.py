@@ -6,7 +6,7 @@ import argparse
 
 from sst_graph.cli.inputs import settings
 from sst_graph.cli.messages import mention
-from sst_graph.cli.outputs import check_apart
+from sst_graph.cli.output_places import check_apart
 from sst_graph.cli.progress import ProgressBar
 from sst_graph.errors import count_of
 from sst_graph.files import atomic_directory

@@ -17,7 +17,7 @@ from sst_graph.cli import EXIT_NOT_TRUSTED
 from sst_graph.cli.inputs import chosen_classes, refuse_unused_classes, settings, starting_point
 from sst_graph.cli.labels import check_classes
 from sst_graph.cli.messages import complain, say
-from sst_graph.cli.outputs import CHECKPOINT_FILE, RERUN_FILE, RESULT_FILE, check_apart
+from sst_graph.cli.output_places import CHECKPOINT_FILE, RERUN_FILE, RESULT_FILE, check_apart
 from sst_graph.cli.progress import ProgressBar, counted
 from sst_graph.cli.reading import open_drive, options_of, warn_of_other_pairs, with_image_topic
 from sst_graph.errors import ConfigError

@@ -10,7 +10,7 @@ import numpy as np
 from sst_graph.batch import CalibrationConfig
 from sst_graph.cli.inputs import chosen_classes
 from sst_graph.cli.messages import mention
-from sst_graph.cli.outputs import RERUN_FILE, check_apart
+from sst_graph.cli.output_places import RERUN_FILE, check_apart
 from sst_graph.cli.pictures import offset_of
 from sst_graph.cli.progress import ProgressBar, counted
 from sst_graph.cli.reading import open_drive_of

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.simulator.camera.textures import LEVELS, TILE, Atlas
-from sst_graph.simulator.casting import IndexArray, compact
-from sst_graph.simulator.mesh import Mesh, normals_of
+from sst_graph.simulator.casting import AT_ONCE, IndexArray, compact
+from sst_graph.simulator.mesh import Mesh, normals_of, seen_from
 from sst_graph.simulator.surfaces import DETAIL, TILE_M, Material
 from sst_graph.types import FloatArray
 
@@ -54,7 +54,21 @@ class View:
 
     def to_camera(self, points: FloatArray) -> FloatArray:
         """World points (..., 3) in the camera frame [m]."""
-        return np.asarray((points - self.position) @ self.rotation)
+        return seen_from(points, self.rotation, self.position)
+
+    def in_sight(self, triangles: FloatArray) -> IndexArray:
+        """Those of the world's triangles (n, 3, 3) that may be in the picture: none of the others is."""
+        camera, (x, _, z) = self.camera, self.rotation.T
+        # What is wholly behind the camera, or a pixel beyond the left or the right border, is out of sight.
+        left, right = camera.fx * x + (camera.cx + 1.0) * z, (camera.width - camera.cx) * z - camera.fx * x
+        planes = np.stack([z, left, right], axis=1)
+        bounds, seen = self.position @ planes, np.empty(len(triangles), np.bool_)
+        for begin in range(0, len(triangles), AT_ONCE):
+            part = slice(begin, begin + AT_ONCE)
+            inside = (triangles[part].reshape(-1, 3) @ planes > bounds).reshape(-1, 3, 3)
+            some = inside[:, 0] | inside[:, 1] | inside[:, 2]
+            seen[part] = some[:, 0] & some[:, 1] & some[:, 2]
+        return np.flatnonzero(seen)
 
 
 def shade(view: View, mesh: Mesh, faces: IndexArray, depth: FloatArray, look: Look) -> NDArray[Any]:
@@ -63,9 +77,7 @@ def shade(view: View, mesh: Mesh, faces: IndexArray, depth: FloatArray, look: Lo
     if seen[0] < 0:
         # The sky borrows any face; it is painted over below.
         seen = np.concatenate([[0], seen[1:]])
-    part = Mesh(
-        mesh.triangles[seen], mesh.kinds[seen], mesh.materials[seen], mesh.colours[seen], mesh.textures[seen]
-    )
+    part = mesh.part(seen)
     ground = faces >= 0
     z = np.where(ground, depth, 1.0).astype(np.float32)
     albedo = _textured(view, part, index, z, look)

@@ -27,8 +27,8 @@ from sst_graph.types import SemanticClass
 STREET = SimulationConfig(
     seed=11,
     frames=14,
-    width=621,
-    height=188,
+    width=414,
+    height=125,
     azimuth_limit_deg=50.0,
     azimuth_step_deg=0.3,
     vehicle_density=0.3,
