@@ -22,10 +22,11 @@ from sst_graph.batch.contradictions import Contradictions, find_contradictions
 from sst_graph.batch.part_solver import PartSolver
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.errors import EstimationError
+from sst_graph.factors.camera import PinholeCamera
 from sst_graph.graph.outer_loop import NARROW_KERNELS_PX, solve_joint
 from sst_graph.graph.state import State
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
-from sst_graph.types import Frame, Guess, Source
+from sst_graph.types import Frame, GroundTruth, Guess, Source
 
 FRAMES = 30
 MOTIONS = ("mixed", "stop_and_go", "no_stop", "turning", "standing", "mixed", "constant", "stop_and_go")
@@ -62,8 +63,21 @@ class Edited:
     source: SimulatedDrive
     frames: Sequence[Frame]
 
-    def __getattr__(self, name: str) -> object:
-        return getattr(self.source, name)
+    @property
+    def name(self) -> str:
+        return self.source.name
+
+    @property
+    def camera(self) -> PinholeCamera:
+        return self.source.camera
+
+    @property
+    def nominal(self) -> gtsam.Pose3:
+        return self.source.nominal
+
+    @property
+    def truth(self) -> GroundTruth:
+        return self.source.truth
 
     def __len__(self) -> int:
         return len(self.frames)

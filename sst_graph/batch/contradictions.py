@@ -109,13 +109,27 @@ def _within(parts: PartSolver, stretches: Sequence[SolvedPart], false_alarm: flo
     """The run of scans of one drive that contradicts the others most, where one does."""
     if len(stretches) < 2:
         return None
-    # 1. The run of stretches that differs most from the rest, as if all stretches were independent.
+    # 1. The runs of stretches that differ most from the rest, as if all stretches were independent: the least
+    # probable one, and the longest step. Mixed sides of a run beside the right one have more clusters behind
+    # them, and a stretch in a false optimum of its own makes a long step.
     runs = _runs(len(stretches))
     differences = {run: _of_run(stretches, run) for run in runs}
-    run = min(runs, key=lambda run: differences[run].rank)
-    if differences[run].p_value * len(runs) > _SUSPICION:
+    suspected = [run for run in runs if differences[run].p_value * len(runs) < _SUSPICION]
+    if not suspected:
         return None
-    # 2. Locate where it begins and ends, and solve both sides by themselves.
+    least = min(suspected, key=lambda run: differences[run].rank)
+    longest = max(suspected, key=lambda run: differences[run].chi2)
+    # 2. Each with both sides solved; what agrees with the labels best is the step.
+    found = [_confirmed(parts, stretches, run) for run in dict.fromkeys((least, longest))]
+    sure = [one for one in found if one is not None and one[0].difference.p_value * len(runs) < false_alarm]
+    return max(sure, key=lambda one: one[1])[0] if sure else None
+
+
+def _confirmed(
+    parts: PartSolver, stretches: Sequence[SolvedPart], run: tuple[int, int]
+) -> tuple[Step, float] | None:
+    """A run with its ends located and both sides solved by themselves, and their support; None where a side
+    has no estimate."""
     inside, outside = ([s.state for s in side] for side in _sides(stretches, run))
     number, last = stretches[0].part.drive, len(parts.drives[stretches[0].part.drive].scans)
     first, end = stretches[run[0]].part.scans[0], stretches[run[1] - 1].part.scans[-1] + 1
@@ -124,7 +138,7 @@ def _within(parts: PartSolver, stretches: Sequence[SolvedPart], false_alarm: flo
         parts.best_start(part, starts)
         for part, starts in zip(_parts_of(number, bounds, last), (inside, outside), strict=True)
     ]
-    difference = differences[run]
+    difference = _of_run(stretches, run)
     for _ in range(_REFINEMENTS):
         bounds, states = _located(parts, number, states)
         own, rest = (
@@ -136,8 +150,8 @@ def _within(parts: PartSolver, stretches: Sequence[SolvedPart], false_alarm: flo
         states, difference = [own.state, rest.state], Difference.of(rest.step, own.step)
         if _located(parts, number, states)[0] == bounds:
             break
-    # 3. Confirm it with both sides solved.
-    return Step(number, bounds, difference) if difference.p_value * len(runs) < false_alarm else None
+    sides = zip(_parts_of(number, bounds, last), states, strict=True)
+    return Step(number, bounds, difference), sum(parts.total_support(*side) for side in sides)
 
 
 _REFINEMENTS = 2

@@ -304,10 +304,10 @@ class OnlineEstimate:
         self.stop_relinearization()
         window.dynamics.test_all()
         self.matcher.check_lower_edges(smoother.point)
-        live, inflation = window.objects.live, self.uncertainty.inflation
+        live = window.objects.live
         try:
             converged = relinearize_window(
-                smoother, self.matcher, NARROW_KERNELS_PX, max_iterations, live, self._share, inflation
+                smoother, self.matcher, NARROW_KERNELS_PX, max_iterations, live, self._share
             )
             self.uncertainty = Uncertainty.of(smoother)
             self.tests.run(smoother)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
@@ -173,6 +174,18 @@ def test_an_image_lost_while_the_numbering_goes_on() -> None:
     assert "an image or a scan was lost" in reason
     (step,) = result.diagnostics["contradictions"]["within"]
     assert step["step"][6] == pytest.approx(street().config.period_s, abs=0.04)
+
+
+@pytest.mark.slow
+def test_an_image_lost_early() -> None:
+    """Four scans before it: their outlines are too far from the estimate's for a kernel, and other runs that
+    hold them beside right ones have more clusters."""
+    result = calibrated([Edited(street(), without_image(frames_of(), 4))])
+    assert result.status == "not_converged"
+    assert abs(first_frame_after(result) - 4) <= 1
+    assert "an image or a scan was lost" in result.reasons[0]
+    found = 1e-3 * float(re.search(r"time offset by ([+-]\d+) ms", result.reasons[0])[1])  # type: ignore[index]
+    assert found == pytest.approx(0.1, abs=0.01)
 
 
 @pytest.mark.slow

@@ -20,6 +20,7 @@ from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.convergence import step_share
 from sst_graph.graph.linear import scaled_inverse
 from sst_graph.tracker.by_edges.kinds import by_edges
+from sst_graph.tracker.uncertainty import Uncertainty
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.tracker.window.matcher import WindowMatcher
 from sst_graph.tracker.window.smoother import WindowSmoother
@@ -71,8 +72,7 @@ def relinearize_window(
     kernels_px: Sequence[float],
     most: int,
     alive: Container[int],
-    share: float = 1.0,
-    inflation: float = 1.0,
+    share: float,
 ) -> bool:
     """Match all scans, solve, and again under the next kernel; then under the last until it converges.
 
@@ -84,7 +84,6 @@ def relinearize_window(
     Args:
         alive: tracks of objects that may be seen again.
         share: factor on the weights of all matches.
-        inflation: how much larger the estimate's covariance is than that of independent matches.
 
     Returns:
         Whether it converged.
@@ -93,6 +92,7 @@ def relinearize_window(
         EstimationError: a step or the update fails; the estimate stays.
     """
     at, converged = smoother.point, False
+    inflation = Uncertainty.of(smoother).inflation
     for i in range(len(kernels_px) + most):
         kernel = RobustKernel("geman_mcclure", kernels_px[min(i, len(kernels_px) - 1)])
         found, missing = matcher.match(at, None, kernel, share)
