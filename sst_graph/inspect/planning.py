@@ -68,7 +68,7 @@ class Prediction(ByValue):
     Attributes:
         name: of the proposal.
         sigmas: (7,) [rad, m, s] after it.
-        worst: sigma of the direction known worst, over the limit: below 1 the status would be ok.
+        worst: largest sigma over its limit (:func:`worst_ratio`): up to 1 the status would be ok.
         bits: information gained [bit]; 0 where a covariance has no inverse, and nothing is known.
         enough: fewest frames that bring ``worst`` below 1, or None where :data:`MOST_FRAMES` don't, or
             where it was not looked for.
