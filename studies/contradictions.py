@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -21,12 +21,12 @@ from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.batch.contradictions import Contradictions, find_contradictions
 from sst_graph.batch.part_solver import PartSolver
 from sst_graph.batch.problem import CalibrationProblem
+from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.errors import EstimationError
-from sst_graph.factors.camera import PinholeCamera
 from sst_graph.graph.outer_loop import NARROW_KERNELS_PX, solve_joint
 from sst_graph.graph.state import State
-from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
-from sst_graph.types import Frame, GroundTruth, Guess, Source
+from sst_graph.simulator import SimulationConfig, simulate
+from sst_graph.types import Frame, Guess, Source
 
 FRAMES = 30
 MOTIONS = ("mixed", "stop_and_go", "no_stop", "turning", "standing", "mixed", "constant", "stop_and_go")
@@ -54,36 +54,6 @@ def street(seed: int) -> SimulationConfig:
         moving_fraction=MOVING[(seed // 2) % 4],
         time_offset_s=OFFSETS_S[(seed // 3) % 4],
     )
-
-
-@dataclass(frozen=True)
-class Edited:
-    """A drive whose frames were changed, as a source."""
-
-    source: SimulatedDrive
-    frames: Sequence[Frame]
-
-    @property
-    def name(self) -> str:
-        return self.source.name
-
-    @property
-    def camera(self) -> PinholeCamera:
-        return self.source.camera
-
-    @property
-    def nominal(self) -> gtsam.Pose3:
-        return self.source.nominal
-
-    @property
-    def truth(self) -> GroundTruth:
-        return self.source.truth
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def __getitem__(self, position: int) -> Frame:
-        return self.frames[position]
 
 
 def knocked(frames: Sequence[Frame], first: int, axis: np.ndarray, degrees: float) -> list[Frame]:
@@ -123,12 +93,12 @@ def contradictions_of(source: Source, start: State) -> Contradictions:
 def found_in(seed: int, edits: Sequence[Callable[[list[Frame]], list[Frame]]]) -> list[Contradictions | None]:
     """What is found in a street's frames after each edit; None where no joint solution exists."""
     drive = simulate(street(seed))
-    frames = list(drive)
+    kept = KeptDrive.of(drive, sweep="auto")
     start = State(drive.truth.cTl, (drive.truth.time_offset_s or 0.0,))
     found: list[Contradictions | None] = []
     for edit in edits:
         try:
-            found.append(contradictions_of(Edited(drive, edit(frames)), start))
+            found.append(contradictions_of(replace(kept, frames=edit(list(kept.frames))), start))
         except EstimationError:
             found.append(None)
     return found

@@ -114,18 +114,22 @@ def _within(parts: PartSolver, stretches: Sequence[SolvedPart], false_alarm: flo
     # them, and a stretch in a false optimum of its own makes a long step.
     runs = _runs(len(stretches))
     differences = {run: _of_run(stretches, run) for run in runs}
-    suspected = [run for run in runs if differences[run].p_value * len(runs) < _SUSPICION]
-    if not suspected:
+    significant = [run for run in runs if differences[run].p_value * len(runs) < _SUSPICION]
+    if not significant:
         return None
-    least = min(suspected, key=lambda run: differences[run].rank)
-    longest = max(suspected, key=lambda run: differences[run].chi2)
-    # 2. Each with both sides solved; what agrees with the labels best is the step.
-    found = [_confirmed(parts, stretches, run) for run in dict.fromkeys((least, longest))]
-    sure = [one for one in found if one is not None and one[0].difference.p_value * len(runs) < false_alarm]
-    return max(sure, key=lambda one: one[1])[0] if sure else None
+    least_probable = min(significant, key=lambda run: differences[run].rank)
+    longest_step = max(significant, key=lambda run: differences[run].chi2)
+    # 2. Each with both sides solved. Of those that are confirmed so, the one that the labels support most.
+    refined = [_refined(parts, stretches, run) for run in dict.fromkeys((least_probable, longest_step))]
+    confirmed = [
+        (step, support)
+        for step, support in filter(None, refined)
+        if step.difference.p_value * len(runs) < false_alarm
+    ]
+    return max(confirmed, key=lambda one: one[1])[0] if confirmed else None
 
 
-def _confirmed(
+def _refined(
     parts: PartSolver, stretches: Sequence[SolvedPart], run: tuple[int, int]
 ) -> tuple[Step, float] | None:
     """A run with its ends located and both sides solved by themselves, and their support; None where a side
@@ -138,7 +142,6 @@ def _confirmed(
         parts.best_start(part, starts)
         for part, starts in zip(_parts_of(number, bounds, last), (inside, outside), strict=True)
     ]
-    difference = _of_run(stretches, run)
     for _ in range(_REFINEMENTS):
         bounds, states = _located(parts, number, states)
         own, rest = (

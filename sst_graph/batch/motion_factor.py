@@ -108,14 +108,12 @@ def fuse_motion(
     if chi2 > MAX_DISAGREEMENT_CHI2 or not motion.converged:
         return WithMotion(labels, _contradiction(step, chi2, motion), facts)
     if motion.misfit is not None:
-        sentence = f"the motion was left out: {motion.misfit}"
-        return WithMotion(labels, diagnostics={"left_out": sentence, **facts}, remarks=(sentence,))
+        return _left_out(labels, f"the motion was left out: {motion.misfit}", facts)
     worst = _worst_stretch(stretches, PartEstimate(step, motion.covariance))
     if worst is not None:
         facts["stretch_p_value"] = worst[1].p_value * len(stretches)
         if facts["stretch_p_value"] < FALSE_ALARM:
-            sentence = _of_stretch(problem.drives, worst, state)
-            return WithMotion(labels, diagnostics={"left_out": sentence, **facts}, remarks=(sentence,))
+            return _left_out(labels, _of_stretch(problem.drives, worst, state), facts)
     # 3. Outlines once more, the motion among the factors.
     factor = gaussian_factor(motion.state, motion.covariance)
     joint = replace(problem.joint(), centre=problem.prior_centre(state), prior=factor)
@@ -137,6 +135,11 @@ def gaussian_factor(state: State, covariance: FloatArray) -> gtsam.LinearContain
     point.insert(EXTRINSIC, state.cTl)
     point.insert(time_offset_key(), np.array(state.time_offsets_s[:1]))
     return gtsam.LinearContainerFactor(linear, point)
+
+
+def _left_out(labels: JointEstimate, sentence: str, facts: Mapping[str, Any]) -> WithMotion:
+    """The estimate as it was, and why."""
+    return WithMotion(labels, diagnostics={"left_out": sentence, **facts}, remarks=(sentence,))
 
 
 def _worst_stretch(

@@ -77,9 +77,10 @@ class PartSolver:
         own = 0.0 if found is None else self.total_support(part, found.state)
         # Where an image or a scan is lost and the numbering goes on, outlines of close objects move too far
         # for a kernel to reach: one frame earlier or later has far more support than what is found here.
-        beside = max(self._frames_beside(part), key=lambda state: self.total_support(part, state))
-        if self.total_support(part, beside) > _FAR_MORE * own:
-            return self._solved(part, beside, self.kernels_px) or found
+        beside = [(self.total_support(part, state), state) for state in self._frames_beside(part)]
+        support, start = max(beside, key=lambda one: one[0])
+        if support > _FAR_MORE * own:
+            return self._solved(part, start, self.kernels_px) or found
         return found
 
     def _frames_beside(self, part: Part) -> list[State]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
+from sst_graph.files.checked_values import put_line
 from sst_graph.files.reading import FileKind, read_text
 
 KITTI_RAW_CALIB = FileKind("a KITTI raw calibration", 1024 * 1024)
@@ -35,9 +36,7 @@ def parse_kitti_raw(text: str, place: str | Path = "calibration") -> dict[str, N
             raise DataError(
                 f"{place}:{number}", f"{words.strip()!r:.60}", f"finite numbers for {name.strip()}"
             )
-        if not np.array_equal(lines.setdefault(name.strip(), values), values):
-            found = f"another {name.strip()} than above"
-            raise DataError(f"{place}:{number}", found, f"one line {name.strip()}")
+        put_line(lines, name.strip(), values, f"{place}:{number}")
     return lines
 
 

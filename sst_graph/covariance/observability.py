@@ -96,10 +96,10 @@ def weak_directions(
     The eigenvectors of the (7, 7) covariance, each unknown measured in its own limit: an eigenvalue above
     1 is a combination known worse than the limits allow.
     """
-    if worst_ratio(covariance, config) <= 1.0:
-        return ()
     limits = limits_of_unknowns(covariance, config)
     scaled = covariance / np.outer(limits, limits)
+    if _worst(scaled) <= 1.0:
+        return ()
     values, vectors = np.linalg.eigh(scaled)
     found = []
     for value, vector in sorted(zip(values, vectors.T, strict=True), key=lambda pair: -pair[0]):
@@ -113,7 +113,11 @@ def worst_ratio(covariance: FloatArray, config: ObservabilityConfig) -> float:
     """Largest standard deviation in units of its limit: of a rotation about any axis, a translation along any
     axis, the time offset."""
     limits = limits_of_unknowns(covariance, config)
-    scaled = covariance / np.outer(limits, limits)
+    return _worst(covariance / np.outer(limits, limits))
+
+
+def _worst(scaled: FloatArray) -> float:
+    """:func:`worst_ratio` of a covariance (7, 7) in units of the limits."""
     parts = (scaled[own, own] for own in (slice(0, 3), slice(3, 6), slice(6, 7)))
     return float(np.sqrt(max(np.linalg.eigvalsh(part)[-1] for part in parts)))
 

@@ -53,13 +53,7 @@ class Mesh:
 
     def part(self, pick: NDArray[np.intp]) -> Mesh:
         """The faces ``pick`` alone."""
-        return Mesh(
-            self.triangles.take(pick, axis=0),
-            self.kinds.take(pick),
-            self.materials.take(pick),
-            self.colours.take(pick, axis=0),
-            self.textures.take(pick, axis=0),
-        )
+        return extended(self, pick, [])
 
     def recoloured(self, mask: NDArray[np.bool_], material: Material, colour: Colour) -> Mesh:
         """The mesh with another material and colour on the faces of ``mask`` (n,)."""

@@ -21,8 +21,7 @@ from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.batch.assumption_tests import ParameterTest, few_objects_factor
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.covariance.jackknife import bounded_ratio
-from sst_graph.errors import EstimationError
-from sst_graph.graph.linear import scaled_inverse
+from sst_graph.tracker.window.gaussian import inverted
 from sst_graph.tracker.window.smoother import WindowSmoother
 
 _EVERY = 10
@@ -36,10 +35,7 @@ def score_findings(smoother: WindowSmoother, config: AssumptionConfig) -> tuple[
         EstimationError: a direction without any information.
     """
     H, g, n = smoother.information(), smoother.vector(), smoother.past.point.size
-    try:
-        follows = -(scaled_inverse(H[:n, :n]) @ H[:n, n:])
-    except np.linalg.LinAlgError as error:
-        raise EstimationError(str(error)) from error
+    follows = -(inverted(H[:n, :n]) @ H[:n, n:])
     A = np.concatenate([follows, np.eye(smoother.past.held)])
     score, information = A.T @ g, np.einsum("nk,nm,mk->k", A, H, A)
     excess = np.einsum("nk,nm,mk->k", A, smoother.excess(with_held=True), A)

@@ -16,7 +16,6 @@ from sst_graph.batch.assumption_tests import with_test_results
 from sst_graph.covariance.considered import Considered, considered_by_steps
 from sst_graph.covariance.undecided_sweep import SweepEffect
 from sst_graph.errors import EstimationError
-from sst_graph.graph.outer_loop import NARROW_KERNELS_PX
 from sst_graph.odometry.sweep import SweepDecision
 from sst_graph.tracker.assumption_tests import AssumptionTests
 from sst_graph.tracker.by_edges.kinds import by_edges
@@ -307,7 +306,7 @@ class OnlineEstimate:
         live = window.objects.live
         try:
             converged = relinearize_window(
-                smoother, self.matcher, NARROW_KERNELS_PX, max_iterations, live, self._share
+                smoother, self.matcher, max_iterations, live, self._share, self.uncertainty.inflation
             )
             self.uncertainty = Uncertainty.of(smoother)
             self.tests.run(smoother)

@@ -22,6 +22,7 @@ from sst_graph.batch.part_solver import Part, PartSolver, SolvedPart
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.config import with_overrides
 from sst_graph.covariance.contradiction import PartEstimate
+from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import Drive
 from sst_graph.graph.outer_loop import JointConfig, solve_joint
 from sst_graph.graph.state import State
@@ -56,21 +57,9 @@ def frames_of(motion: str = "no_stop", frames: int = 24) -> tuple[Frame, ...]:
     return tuple(street(motion, frames))
 
 
-class Edited:
+def edited(source: Source, frames: Sequence[Frame], name: str = "edited") -> KeptDrive:
     """Frames of a drive that were changed, as a source with a name of its own."""
-
-    def __init__(self, source: Source, frames: Sequence[Frame], name: str = "edited") -> None:
-        self.name, self.camera, self.nominal, self.truth = name, source.camera, source.nominal, source.truth
-        self._frames = list(frames)
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def __getitem__(self, position: int) -> Frame:
-        return self._frames[position]
-
-    def __iter__(self):  # type: ignore[no-untyped-def]
-        return iter(self._frames)
+    return KeptDrive(name, source.camera, source.nominal, source.truth, frames)
 
 
 def knocked(frames: Sequence[Frame], first: int, degrees: float) -> list[Frame]:
@@ -120,7 +109,7 @@ def calibrated(sources: Sequence[Source], config: CalibrationConfig = CONFIG) ->
 def prepared() -> list[Drive]:
     """Twelve frames of a clean drive."""
     clean = simulated(TRACKED_STREET)
-    return prepare_drives([Edited(clean, [clean[k] for k in range(12)])], CONFIG)
+    return prepare_drives([edited(clean, [clean[k] for k in range(12)])], CONFIG)
 
 
 def parts_of(drives: Sequence[Drive]) -> PartSolver:
@@ -140,7 +129,7 @@ def first_frame_after(result: CalibrationResult) -> int:
 
 @pytest.mark.slow
 def test_a_clean_drive_contradicts_nothing() -> None:
-    result = calibrated([Edited(street(), frames_of())])
+    result = calibrated([edited(street(), frames_of())])
     assert result.diagnostics["contradictions"] == {"within": [], "between": {}}
     assert not [reason for reason in result.reasons if "contradict" in reason]
 
@@ -148,7 +137,7 @@ def test_a_clean_drive_contradicts_nothing() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("first", "degrees"), [(12, 2.0), (9, -0.7)])
 def test_a_mount_knocked_while_moving(first: int, degrees: float) -> None:
-    result = calibrated([Edited(street(), knocked(frames_of(), first, degrees))])
+    result = calibrated([edited(street(), knocked(frames_of(), first, degrees))])
     assert result.status == "not_converged"
     assert abs(first_frame_after(result) - first) <= 3
     (reason,) = [reason for reason in result.reasons if "contradict each other" in reason]
@@ -160,14 +149,14 @@ def test_a_mount_knocked_while_moving(first: int, degrees: float) -> None:
 @pytest.mark.slow
 def test_a_mount_knocked_while_standing() -> None:
     source, frames = street("standing", 12), frames_of("standing", 12)
-    result = calibrated([Edited(source, knocked(frames, 6, 2.0))])
+    result = calibrated([edited(source, knocked(frames, 6, 2.0))])
     assert result.status == "not_converged"
     assert abs(first_frame_after(result) - 6) <= 3
 
 
 @pytest.mark.slow
 def test_an_image_lost_while_the_numbering_goes_on() -> None:
-    result = calibrated([Edited(street(), without_image(frames_of(), 12))])
+    result = calibrated([edited(street(), without_image(frames_of(), 12))])
     assert result.status == "not_converged"
     assert abs(first_frame_after(result) - 12) <= 3
     (reason,) = [reason for reason in result.reasons if "contradict each other" in reason]
@@ -180,7 +169,7 @@ def test_an_image_lost_while_the_numbering_goes_on() -> None:
 def test_an_image_lost_early() -> None:
     """Four scans before it: their outlines are too far from the estimate's for a kernel, and other runs that
     hold them beside right ones have more clusters."""
-    result = calibrated([Edited(street(), without_image(frames_of(), 4))])
+    result = calibrated([edited(street(), without_image(frames_of(), 4))])
     assert result.status == "not_converged"
     assert abs(first_frame_after(result) - 4) <= 1
     assert "an image or a scan was lost" in result.reasons[0]
@@ -190,7 +179,7 @@ def test_an_image_lost_early() -> None:
 
 @pytest.mark.slow
 def test_masks_that_slide() -> None:
-    result = calibrated([Edited(street(), sliding(frames_of(), 10))])
+    result = calibrated([edited(street(), sliding(frames_of(), 10))])
     assert result.status == "not_converged"
     assert any("the masks slide" in reason for reason in result.reasons)
 
@@ -198,7 +187,7 @@ def test_masks_that_slide() -> None:
 @pytest.mark.slow
 def test_no_check_no_contradiction() -> None:
     config = with_overrides(CONFIG, ["check_contradictions=false"])
-    result = calibrated([Edited(street(), knocked(frames_of(), 12, 2.0))], config)
+    result = calibrated([edited(street(), knocked(frames_of(), 12, 2.0))], config)
     assert not [reason for reason in result.reasons if "contradict each other" in reason]
 
 
@@ -207,7 +196,7 @@ def test_no_check_no_contradiction() -> None:
 def test_drives_of_two_rigs(own_offsets: str) -> None:
     config = with_overrides(CONFIG, [f"time_offset_per_drive={own_offsets}"])
     frames = frames_of()
-    two = [Edited(street(), frames[:12], "a"), Edited(street(), knocked(frames[12:], 0, 1.1), "b")]
+    two = [edited(street(), frames[:12], "a"), edited(street(), knocked(frames[12:], 0, 1.1), "b")]
     result = calibrated(two, config)
     assert result.status == "not_converged"
     (reason,) = [reason for reason in result.reasons if "contradicts" in reason]
@@ -218,7 +207,7 @@ def test_drives_of_two_rigs(own_offsets: str) -> None:
 @pytest.mark.slow
 def test_drives_of_one_rig() -> None:
     frames = frames_of()
-    clean = calibrated([Edited(street(), frames[:12], "a"), Edited(street(), frames[12:], "b")])
+    clean = calibrated([edited(street(), frames[:12], "a"), edited(street(), frames[12:], "b")])
     assert set(clean.diagnostics["contradictions"]["between"]) == {"b"}
     assert not [reason for reason in clean.reasons if "contradict" in reason]
 
@@ -227,8 +216,8 @@ def test_drives_of_one_rig() -> None:
 def test_the_offset_of_every_drive_counts() -> None:
     """A standing drive cannot tell its own time offset, whichever drive comes first."""
     config = with_overrides(CONFIG, ["time_offset_per_drive=true"])
-    moving = Edited(street(), frames_of()[:12], "moving")
-    standing = Edited(street("standing", 12), frames_of("standing", 12)[:4], "standing")
+    moving = edited(street(), frames_of()[:12], "moving")
+    standing = edited(street("standing", 12), frames_of("standing", 12)[:4], "standing")
     for order in ([moving, standing], [standing, moving]):
         result = calibrated(order, config)
         assert result.status != "ok"
@@ -290,6 +279,6 @@ def test_motion_that_contradicts_a_stretch_is_left_out() -> None:
 def test_a_knock_on_a_real_drive() -> None:
     source = open_source(STOP)
     frames = knocked(list(source), 30, 2.0)
-    result = calibrate_prepared(prepare_drives([Edited(source, frames)], CONFIG), source.nominal, CONFIG)
+    result = calibrate_prepared(prepare_drives([edited(source, frames)], CONFIG), source.nominal, CONFIG)
     assert result.status == "not_converged"
     assert abs(first_frame_after(result) - 30) <= 3

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.files.checked_values import checked_pose, pinhole_camera
+from sst_graph.files.checked_values import checked_pose, pinhole_camera, put_line
 from sst_graph.files.reading import CALIB_TXT, read_text
 
 FloatArray = NDArray[np.float64]
@@ -124,9 +124,8 @@ def read_calibration(path: Path) -> KittiCalibration:
         name = name.strip()
         if not colon or not re.fullmatch(r"P\d|Tr", name):
             continue
-        matrix = _matrix(values.split(), name, f"{path}:{number}")
-        if not np.array_equal(matrices.setdefault(name, matrix), matrix):
-            raise DataError(f"{path}:{number}", f"another {name} than above", f"one line {name}")
+        place = f"{path}:{number}"
+        put_line(matrices, name, _matrix(values.split(), name, place), place)
     projections = {int(name[1:]): matrix for name, matrix in matrices.items() if name != "Tr"}
     c0Tl = pose_from(matrices["Tr"], f"{path} (Tr)") if "Tr" in matrices else None
     return KittiCalibration(path, projections, c0Tl)

@@ -12,6 +12,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.errors import EstimationError
 from sst_graph.factors import custom_factor
 from sst_graph.graph.linear import scaled_inverse, scattered
 from sst_graph.graph.state import State, lower_edge_track
@@ -291,6 +292,18 @@ class Gaussian:
         dims = [end - start for start, end in pairwise(starts)]
         factor = custom_factor(gtsam.noiseModel.Unit.Create(n), keys, linear, dims, n)
         return gtsam.LinearContainerFactor(factor.linearize(values), values)
+
+
+def inverted(information: FloatArray) -> FloatArray:
+    """(n, n) covariance of independent matches from their information.
+
+    Raises:
+        EstimationError: a direction without any information.
+    """
+    try:
+        return scaled_inverse(information)
+    except np.linalg.LinAlgError as error:
+        raise EstimationError(str(error)) from error
 
 
 @lru_cache(maxsize=4096)

@@ -6,7 +6,7 @@ At the end of a drive at once (:func:`relinearize_window`); while frames come, a
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+from collections.abc import Container
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,13 +15,11 @@ from numpy.typing import NDArray
 from sst_graph.batch.by_edges.optimum import CONVERGED_STEP
 from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX
 from sst_graph.batch.lower_edges import LowerEdgeSupport
-from sst_graph.errors import EstimationError
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.convergence import step_share
-from sst_graph.graph.linear import scaled_inverse
+from sst_graph.graph.outer_loop import NARROW_KERNELS_PX
 from sst_graph.tracker.by_edges.kinds import by_edges
-from sst_graph.tracker.uncertainty import Uncertainty
-from sst_graph.tracker.window.gaussian import Point
+from sst_graph.tracker.window.gaussian import Point, inverted
 from sst_graph.tracker.window.matcher import WindowMatcher
 from sst_graph.tracker.window.smoother import WindowSmoother
 
@@ -69,10 +67,10 @@ class RelinearizationSchedule:
 def relinearize_window(
     smoother: WindowSmoother,
     matcher: WindowMatcher,
-    kernels_px: Sequence[float],
     most: int,
     alive: Container[int],
     share: float,
+    inflation: float,
 ) -> bool:
     """Match all scans, solve, and again under the next kernel; then under the last until it converges.
 
@@ -82,8 +80,10 @@ def relinearize_window(
     only.
 
     Args:
+        most: further steps under the last kernel.
         alive: tracks of objects that may be seen again.
         share: factor on the weights of all matches.
+        inflation: how much larger the estimate's covariance is than that of independent matches.
 
     Returns:
         Whether it converged.
@@ -92,12 +92,12 @@ def relinearize_window(
         EstimationError: a step or the update fails; the estimate stays.
     """
     at, converged = smoother.point, False
-    inflation = Uncertainty.of(smoother).inflation
+    kernels_px = NARROW_KERNELS_PX
     for i in range(len(kernels_px) + most):
         kernel = RobustKernel("geman_mcclure", kernels_px[min(i, len(kernels_px) - 1)])
         found, missing = matcher.match(at, None, kernel, share)
         window = smoother.window_with(found, at)
-        P = _inverse(window.information)
+        P = inverted(window.information)
         step, m, last = P @ window.vector, at.core_size, i + 1 - len(kernels_px)
         if last >= 0 and _is_short(step[:m], inflation * P[:m, :m], matcher):
             converged = True
@@ -108,18 +108,6 @@ def relinearize_window(
     if not converged:
         smoother.set_point(at)
     return converged
-
-
-def _inverse(information: FloatArray) -> FloatArray:
-    """(n, n) its inverse.
-
-    Raises:
-        EstimationError: there is none.
-    """
-    try:
-        return scaled_inverse(information)
-    except np.linalg.LinAlgError as error:
-        raise EstimationError(str(error)) from error
 
 
 def _is_short(step: FloatArray, P: FloatArray, matcher: WindowMatcher) -> bool:

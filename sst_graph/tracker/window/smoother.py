@@ -19,7 +19,6 @@ from sst_graph.covariance.jackknife import composed
 from sst_graph.errors import EstimationError
 from sst_graph.factors import extrinsic_drift, time_offset_drift
 from sst_graph.graph.building import motion_factor, silhouettes_factor
-from sst_graph.graph.linear import scaled_inverse
 from sst_graph.graph.matching import GraphConfig
 from sst_graph.graph.state import (
     bias_key,
@@ -33,7 +32,7 @@ from sst_graph.tracker.config import DriftConfig
 from sst_graph.tracker.sums.held import held_names
 from sst_graph.tracker.sums.running_sums import RunningSums
 from sst_graph.tracker.window.epochs import Epoch, EpochSums, MatchedPair, RetiredEpoch
-from sst_graph.tracker.window.gaussian import Gaussian, Point, insert_point
+from sst_graph.tracker.window.gaussian import Gaussian, Point, insert_point, inverted
 from sst_graph.tracker.window.smoother_update import SmootherUpdate, TwistFactor, read_point
 from sst_graph.types import SemanticClass
 
@@ -368,10 +367,7 @@ class WindowSmoother:
         """
         n = self.past.point.size
         information = (self.information() if information is None else information)[:n, :n]
-        try:
-            naive = scaled_inverse(information)
-        except np.linalg.LinAlgError as error:
-            raise EstimationError(str(error)) from error
+        naive = inverted(information)
         robust = naive + naive @ self.excess() @ naive
         spread = None
         if not self.drift.enabled:
