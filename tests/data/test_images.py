@@ -202,9 +202,9 @@ def decode():
     while not done.is_set():
         read_mask(mask)
 
-thread = threading.Thread(target=decode)
+stderr = os.fstat(2).st_ino  # before the thread: while it decodes, the process's stderr is a pipe
+thread = threading.Thread(target=decode, daemon=True)
 thread.start()
-stderr = os.fstat(2).st_ino
 for _ in range(5):
     child = os.fork()
     if child == 0:
