@@ -124,11 +124,12 @@ class PartSolver:
     def _step(self, part: Part, solution: JointSolution) -> PartEstimate:
         objects = [tracks_of_scans(self.problem.objects[part.drive], part.scans)]
         estimate = JointEstimate.of(solution, objects)
-        extra = estimate.considered(self.problem.config.assumptions).covariance(7)
+        considered = estimate.considered(self.problem.config.assumptions)
+        common = np.reshape([considered.step(name)[:7] for name in considered.sigmas], (-1, 7)).T
         # By static objects alone: a vehicle that brakes looks like another time offset.
-        covariance = estimate.by_static_objects[:7, :7] + extra
+        covariance = estimate.by_static_objects[:7, :7]
         step = difference(self.reference_of(part), solution.state)
-        return PartEstimate(step, covariance, estimate.robust.table.clusters)
+        return PartEstimate(step, covariance, estimate.robust.table.clusters, common)
 
     def _data(self, part: Part) -> tuple[Drive, Tracks]:
         """The drive and its tracks, of the part's scans alone."""

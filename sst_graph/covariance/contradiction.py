@@ -11,7 +11,7 @@ that a part does not determine has a large variance in the difference and so doe
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 
 import gtsam
@@ -43,11 +43,15 @@ class PartEstimate:
             (right perturbation: rotation [rad], translation [m], offset [s]).
         covariance: (7, 7) of it, cluster-robust.
         clusters: effective number of independent clusters (sides of objects) that the covariance rests on.
+        common: (7, k) shift of the estimate by one deviation of each of k errors that all parts share, such
+            as a principal point that is off; what shifts both parts alike is no contradiction, and does not
+            hide one.
     """
 
     step: FloatArray
     covariance: FloatArray
     clusters: float = np.inf
+    common: FloatArray = field(default_factory=lambda: np.zeros((7, 0)))
 
 
 @dataclass(frozen=True)
@@ -66,7 +70,7 @@ class Difference:
 
     @classmethod
     def of(cls, one: PartEstimate, other: PartEstimate, own_offsets: bool = False) -> Difference:
-        """From one part to another that is independent of it.
+        """From one part to another that is independent of it but for what they have in common.
 
         The degrees of freedom are Welch's, along the step: those of the part that is known worse count most
         (Nel and van der Merwe, A solution to the multivariate Behrens-Fisher problem, 1986).
@@ -75,7 +79,9 @@ class Difference:
             own_offsets: each part has a time offset of its own: only the extrinsics are compared.
         """
         n = 6 if own_offsets else 7
-        step, covariance = (other.step - one.step)[:n], (one.covariance + other.covariance)[:n, :n]
+        common = _padded(other.common, one.common) - _padded(one.common, other.common)
+        step = (other.step - one.step)[:n]
+        covariance = (one.covariance + other.covariance + common @ common.T)[:n, :n]
         along = np.linalg.solve(covariance, step)
         total = max(float(along @ covariance @ along), 1e-300)
         freedom = sum(
@@ -107,8 +113,16 @@ def combined(parts: Sequence[PartEstimate]) -> PartEstimate:
     """The estimate of several independent parts together, weighted by their information."""
     information = [np.linalg.inv(part.covariance) for part in parts]
     covariance = np.asarray(np.linalg.inv(np.sum(information, axis=0)))
-    weighted = np.sum([H @ part.step for H, part in zip(information, parts, strict=True)], axis=0)
-    return PartEstimate(covariance @ weighted, covariance, sum(part.clusters for part in parts))
+    weighted, common = (
+        covariance @ np.sum([H @ each for H, each in zip(information, values, strict=True)], axis=0)
+        for values in ([part.step for part in parts], [part.common for part in parts])
+    )
+    return PartEstimate(weighted, covariance, sum(part.clusters for part in parts), common)
+
+
+def _padded(common: FloatArray, like: FloatArray) -> FloatArray:
+    """Shifts by errors, 0 for those that only ``like`` has."""
+    return np.pad(common, ((0, 0), (0, max(0, like.shape[1] - common.shape[1]))))
 
 
 @dataclass(frozen=True)

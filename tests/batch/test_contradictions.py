@@ -135,7 +135,7 @@ def test_a_clean_drive_contradicts_nothing() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("first", "degrees"), [(12, 2.0), (9, -0.7)])
+@pytest.mark.parametrize(("first", "degrees"), [(12, 2.0), (9, -0.7), (12, 0.4)])
 def test_a_mount_knocked_while_moving(first: int, degrees: float) -> None:
     result = calibrated([edited(street(), knocked(frames_of(), first, degrees))])
     assert result.status == "not_converged"

@@ -72,6 +72,26 @@ def test_combined_parts_are_weighted_by_their_information() -> None:
     np.testing.assert_allclose(np.diag(both.covariance), SIGMAS**2 / 5.0, rtol=1e-9)
 
 
+def test_what_shifts_both_parts_alike_hides_no_step() -> None:
+    """As a principal point that is off does; what shifts one part more than the other counts."""
+    shift, more = np.zeros((7, 1)), np.zeros((7, 1))
+    shift[1], more[1] = 50.0 * SIGMAS[1], 53.0 * SIGMAS[1]
+    one = replace(part(np.zeros(7)), common=shift)
+    step = 8.0 * SIGMAS * np.eye(7)[1]
+    alike = Difference.of(one, replace(part(step), common=shift))
+    assert alike.chi2 == pytest.approx(64.0 / 2.0)
+    assert Difference.of(one, replace(part(step), common=more)).chi2 == pytest.approx(64.0 / 11.0)
+    # a part of other sensors shares none of it
+    assert Difference.of(one, part(step)).chi2 == pytest.approx(64.0 / 2502.0)
+    assert Difference.of(part(step), one).chi2 == pytest.approx(64.0 / 2502.0)
+
+
+def test_what_combined_parts_have_in_common_is_weighted_as_they_are() -> None:
+    one = replace(part(np.zeros(7)), common=np.full((7, 2), 1.0))
+    other = replace(part(np.zeros(7), SIGMAS / 2.0), common=np.full((7, 2), 6.0))
+    np.testing.assert_allclose(combined([one, other]).common, 0.2 * 1.0 + 0.8 * 6.0)
+
+
 @pytest.mark.parametrize(
     ("column", "size", "words"),
     [
