@@ -221,7 +221,7 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
     motion = with_motion(problem, labels_alone, contradictions.stretches)
     # 6. Assumptions: tested against the data, considered in the covariance.
     tests, considered = examine_assumptions(problem, motion.estimate, lens_beside_labels)
-    # 7. Total covariance: with unmeasured motion and undecided sweeps, which no match shows.
+    # 7. Total covariance: with pictures that shift, unmeasured motion and undecided sweeps.
     total = total_covariance(problem, motion.estimate, considered)
     # 8. How it fits the labels, point by point.
     fit = fit_of(problem, (start_solution, lower.solutions[0], motion.estimate.solution), total.covariance)
@@ -234,7 +234,7 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
         total.covariance,
         frames_used(drives, solution),
         (*_contradicted(tests, contradictions, wrong), *motion.reasons, *total.reasons),
-        (*unknown_motion_remarks(drives), *motion.remarks),
+        (*unknown_motion_remarks(drives), *motion.remarks, *total.remarks),
         motion.estimate.by_static_objects[:7, :7],
         drive_offsets(drives, solution.state, unknowns),
         total.by_drive,
@@ -243,6 +243,7 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
         | {
             "motion": motion.diagnostics,
             "assumptions": assumption_report(considered, tests),
+            "image_shift_px": total.shifts.sigmas_px.round(3).tolist(),
             BUDGET: total.budget,
         }
         | joint_diagnostics(problem, motion.estimate, lower),

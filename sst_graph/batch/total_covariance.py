@@ -1,7 +1,8 @@
 """The total covariance of a joint estimate.
 
-It is the sum of the parts by matches, by assumptions, by unmeasured motion, and by sweeps that the scans
-leave undecided: for these the problem is solved again with the point times of each remaining hypothesis.
+It is the sum of the parts by matches, by pictures that shift from image to image, by assumptions, by
+unmeasured motion, and by sweeps that the scans leave undecided: for these the problem is solved again with
+the point times of each remaining hypothesis.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from sst_graph.batch.method_estimate import DriveCovariance
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.covariance.considered import Considered, budget, motion_covariance, remainder
+from sst_graph.covariance.image_shifts import ImageShifts, image_shifts
 from sst_graph.covariance.undecided_sweep import SweepEffect
 from sst_graph.covariance.unknown_motion import unknown_motion_covariance
 from sst_graph.graph.frozen_problem import FrozenProblem
@@ -31,36 +33,45 @@ class TotalCovariance:
     """How well a joint estimate is known.
 
     Attributes:
-        unknowns: (n, n) of the extrinsic and all offsets, by matches and assumptions.
+        unknowns: (n, n) of the extrinsic and all offsets, by matches, shifts of the pictures and assumptions.
         covariance: (7, 7) of the extrinsic and the first offset, by everything.
         by_drive: where drives have an offset each, of the extrinsic and that offset.
         budget: sigmas (7) by each part, JSON-able.
         reasons: sweeps that nothing decides and that matter.
         by_sweeps: (7, 7) part of it by sweeps that the scans leave undecided.
+        shifts: of the pictures from image to image.
     """
 
     unknowns: FloatArray
     covariance: FloatArray
     by_drive: tuple[DriveCovariance, ...]
     budget: dict[str, list[float]]
+    shifts: ImageShifts
     reasons: tuple[str, ...] = ()
     by_sweeps: FloatArray = field(default_factory=lambda: np.zeros((7, 7)))
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """That the pictures shift, where it matters."""
+        sentence = self.shifts.sentence(self.covariance)
+        return (sentence,) if sentence else ()
 
 
 def total_covariance(
     problem: CalibrationProblem, estimate: JointEstimate, considered: Considered
 ) -> TotalCovariance:
-    """The covariance by matches, assumptions, unknown motion and undecided sweeps.
+    """The covariance by matches, shifts of the pictures, assumptions, unknown motion and undecided sweeps.
 
     Args:
         considered: what the assumptions add.
     """
     solution, joint = estimate.solution, problem.config.joint
     size = 6 + len(solution.state.time_offsets_s)
-    # 1. Matches and assumptions.
+    # 1. Matches, pictures that shift from image to image, and assumptions.
     motion = motion_covariance(estimate.robust, solution.pairs, solution.state, joint.graph)
-    parts = budget(estimate.covariance, motion, considered)
-    unknowns = estimate.covariance[:size, :size] + considered.covariance(size)
+    shifts = image_shifts(estimate.robust, solution.pairs, solution.values, solution.state)
+    parts = budget(estimate.covariance, motion, shifts.covariance, considered)
+    unknowns = (estimate.covariance + shifts.covariance)[:size, :size] + considered.covariance(size)
     # 2. Motion that nothing measures.
     known = unknowns[:7, :7] + _unknown_motion(problem, solution, float(unknowns[6, 6]))
     # 3. Sweeps.
@@ -68,7 +79,7 @@ def total_covariance(
     total = known + sweeps.covariance
     by_drive = _by_drive(problem, estimate, unknowns)
     spent = parts | remainder(total, unknowns)
-    return TotalCovariance(unknowns, total, by_drive, spent, sweeps.reasons, sweeps.covariance)
+    return TotalCovariance(unknowns, total, by_drive, spent, shifts, sweeps.reasons, sweeps.covariance)
 
 
 def _unknown_motion(problem: CalibrationProblem, solution: JointSolution, variance_s2: float) -> FloatArray:

@@ -32,6 +32,8 @@ FloatArray = NDArray[np.float64]
 
 BUDGET = "sigma_budget"
 """Key of :func:`budget` among a result's diagnostics."""
+SHIFTS = "shifts from image to image"
+"""Name of the part of a budget by pictures that shift."""
 
 
 _Sigmas = make_dataclass(
@@ -207,17 +209,21 @@ def motion_covariance(
     return np.asarray(robust.bread - marginal_covariance(graph, values, robust.unknowns))
 
 
-def budget(covariance: FloatArray, motion: FloatArray, considered: Considered) -> dict[str, list[float]]:
+def budget(
+    covariance: FloatArray, motion: FloatArray, shifts: FloatArray, considered: Considered
+) -> dict[str, list[float]]:
     """JSON-able: the contribution of each part to the covariance of extrinsic and first offset, as sigmas
     (7).
 
     Args:
         covariance: (n, n) of matches and motion.
         motion: (n, n) part of it, by :func:`motion_covariance`.
+        shifts: (n, n) by pictures that shift from image to image.
         considered: by the assumptions.
     """
     moved = np.clip(np.diag(motion)[:7], 0.0, np.diag(covariance)[:7])
     parts = {"matches": np.diag(covariance)[:7] - moved, "motion": moved}
+    parts[SHIFTS] = np.diag(shifts)[:7]
     parts |= {name: np.diag(considered.part(name))[:7] for name in considered.sigmas}
     return {name: [float(f"{value:.6g}") for value in np.sqrt(part)] for name, part in parts.items()}
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.assumptions import ASSUMPTIONS
-from sst_graph.covariance.considered import BUDGET
+from sst_graph.covariance.considered import BUDGET, SHIFTS
 from sst_graph.errors import printable
 from sst_graph.files.checked_values import is_number
 from sst_graph.result import CalibrationResult
@@ -24,7 +24,7 @@ _PARTS_OF_EDGES = {
 }
 """Parts of a covariance by edges in words (docs/how-to/edges.md)."""
 _LEAST_SHARE = 0.01
-"""Parts that give less than this share of every variance are not shown."""
+"""Assumptions and shifts that give less than this share of every variance are not shown."""
 
 
 def budget_lines(result: CalibrationResult) -> list[str]:
@@ -35,7 +35,7 @@ def budget_lines(result: CalibrationResult) -> list[str]:
     total = np.diag(result.covariance)
     lines = ["where the sigmas come from (largest axis)     rotation  translation  time offset"]
     for name, sigmas in parts.items():
-        if name in ASSUMPTIONS and (sigmas**2 < _LEAST_SHARE * total).all():
+        if name in (*ASSUMPTIONS, SHIFTS) and (sigmas**2 < _LEAST_SHARE * total).all():
             continue
         rotation, translation = np.degrees(sigmas[:3].max()), 100.0 * sigmas[3:6].max()
         label = printable(name) if name not in ASSUMPTIONS else _label(name, result)
