@@ -248,9 +248,9 @@ def _check_same(job: Job, data: bytes | None) -> None:
         before = Record.from_json(data, job.record.url)
     except DataError:
         return  # it is written anew
-    if before.has_result and before.place != job.drive.place.url:
+    if before.has_result and Place(before.place).whole(job.folder) != job.place:
         raise ConfigError(
-            f"{job.drive.place}: found a result of {before.place} under the name {job.drive.name}, "
+            f"{job.place}: found a result of {before.place} under the name {job.drive.name}, "
             "expected one of the same data (names differ with --name-parts 2, or another --out)"
         )
 
