@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from sst_graph.config import Settings, setting
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.files.json_table import json_table
-from sst_graph.files.reading import parse_json
+from sst_graph.files.reading import FileKind, digest_of_file, parse_json
 from sst_graph.files.staging import lock_file
 from sst_graph.files.strict_json import strict_json
 from sst_graph.fleet.attempt import DRIVES, RECORDS, Job, finished_record, run_drive
@@ -31,11 +32,15 @@ from sst_graph.fleet.summary.page import summary_html
 from sst_graph.fleet.summary.tables import Row, csv_bytes, drive_rows, parquet_bytes, vehicle_rows
 from sst_graph.fleet.vehicles.fused import Vehicle, vehicle_json, vehicles_of
 from sst_graph.fleet.vehicles.walk import WalkConfig
+from sst_graph.result import result_file
 
 BATCH = "batch.json"
 FORMAT = "sst-graph/batch"
 VERSION = 1
 LOCK = ".sst-graph-batch.lock"
+
+_NAME_FILES = ("--config", "--init", "--image-model", "--lidar-model")
+_OPTION_FILE = FileKind("a file that an option names", 2**36)
 
 Told = Callable[["Progress"], None]
 
@@ -128,6 +133,7 @@ def open_batch(out: Place, options: Sequence[str]) -> Iterator[None]:
             parse_json(_utf8((out / BATCH).read(), place), place, BATCH), place, FORMAT, VERSION
         )
         before = [str(one) for one in table.sequence("options")]
+        _check_files(out, table.mapping("files"), options)
         if before != list(options):
             raise ConfigError(
                 f"{out}: was begun with the options {' '.join(before) or '(none)'}, found "
@@ -140,10 +146,35 @@ def open_batch(out: Place, options: Sequence[str]) -> Iterator[None]:
         )
     with _locked(out):
         if not (out / BATCH).exists():
-            document = {"format": FORMAT, "version": VERSION, "options": list(options)}
+            document = {
+                "format": FORMAT,
+                "version": VERSION,
+                "options": list(options),
+                "files": _digests(options),
+            }
             (out / BATCH).write((strict_json(document) + "\n").encode("utf-8"))
         sweep_scratch()
         yield
+
+
+def _digests(options: Sequence[str]) -> dict[str, str]:
+    """SHA-256 of the files that options name, by option."""
+    found = {}
+    for option in options:
+        name, _, value = option.partition("=")
+        path = result_file(Path(value))
+        if name in _NAME_FILES and path.is_file():
+            found[option] = digest_of_file(path, _OPTION_FILE).hex()
+    return found
+
+
+def _check_files(out: Place, before: Mapping[str, object], options: Sequence[str]) -> None:
+    """Refuse a file that is another one than when the batch was begun: results of both would be mixed."""
+    for option, digest in _digests(options).items():
+        if before.get(option, digest) != digest:
+            raise ConfigError(
+                f"{out}: was begun with other contents of {option}, expected the same (or another --out)"
+            )
 
 
 def run_batch(

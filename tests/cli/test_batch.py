@@ -240,6 +240,21 @@ def test_other_options_do_not_mix(drives: Path, tmp_path: Path, capfd: pytest.Ca
     assert main(["batch", bad, "--out", str(out)]) == 2
 
 
+def test_a_file_of_the_options_is_the_same_to_the_end(
+    drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """An edited --config would give half of the drives other settings."""
+    (tmp_path / "settings.json").write_text('{"seed": 1}')
+    command = ["batch", str(drives / "v2_*-08"), "--out", str(tmp_path / "out"), "--retries", "0"]
+    command += ["--config", str(tmp_path / "settings.json")]
+    assert main(command) == 3 == main(command)
+    (tmp_path / "settings.json").write_text('{"seed": 2}')
+    capfd.readouterr()
+    assert main(command) == 2
+    said = capfd.readouterr().err
+    assert f"was begun with other contents of --config={tmp_path}/settings.json" in said
+
+
 def test_two_batches_do_not_meet(drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     from sst_graph.fleet import open_batch
 
