@@ -22,7 +22,7 @@ from sst_graph.files.staging import lock_file
 from sst_graph.files.strict_json import strict_json
 from sst_graph.fleet.attempt import DRIVES, RECORDS, Job, finished_record, run_drive
 from sst_graph.fleet.dask_pool import Cluster, run_on_dask
-from sst_graph.fleet.drives import Drive, file_name
+from sst_graph.fleet.drives import Drive, vehicle_files
 from sst_graph.fleet.isolated import Limits
 from sst_graph.fleet.local_pool import run_locally
 from sst_graph.fleet.places import Place, read_many
@@ -234,24 +234,12 @@ def write_summary(
     for name, data in contents.items():
         if data is not None:
             (out / name).write(data)
-    names = _vehicle_files(vehicles)
+    names = vehicle_files(vehicle.name for vehicle in vehicles)
     for vehicle in vehicles:
         (out / "vehicles" / names[vehicle.name]).write(
             vehicle_json(vehicle, records, config.walk).encode("utf-8")
         )
     return Outcome(rows, vehicles, written)
-
-
-def _vehicle_files(vehicles: Sequence[Vehicle]) -> dict[str, str]:
-    """A file's name for each vehicle."""
-    files: dict[str, str] = {}
-    for vehicle in vehicles:
-        name = f"{file_name(vehicle.name)}.json"
-        if name in files.values():
-            other = next(one for one, taken in files.items() if taken == name)
-            raise ConfigError(f"vehicles {other!r} and {vehicle.name!r}: found one file {name} for both")
-        files[vehicle.name] = name
-    return files
 
 
 def _finished(jobs: Sequence[Job], out: Place) -> dict[str, Record]:

@@ -240,6 +240,17 @@ def test_other_options_do_not_mix(drives: Path, tmp_path: Path, capfd: pytest.Ca
     assert main(["batch", bad, "--out", str(out)]) == 2
 
 
+def test_drives_of_no_known_vehicle_are_named(
+    drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("v1_2026-03-01", "v1_2026-03-08", "v2_2026-03-01"):
+        (drives / name / "sequences/00/calib.txt").write_text("P0: 1")
+    command = ["batch", str(drives), "--out", str(tmp_path / "out"), "--vehicle-from", r"(?P<vehicle>v1)_"]
+    assert main(command) == 3
+    said = capfd.readouterr().err
+    assert "note: no vehicle is known of 2 drives: v2_2026-03-01, v2_2026-03-08" in said
+
+
 def test_a_file_of_the_options_is_the_same_to_the_end(
     drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
