@@ -37,8 +37,9 @@ from sst_graph.tracker.storage.resume import Setup
 from sst_graph.tracker.storage.snapshot import Snapshot
 from sst_graph.tracker.track_update import Sensor, TrackUpdate
 from sst_graph.tracker.window.matcher import WindowMatcher
+from sst_graph.timestamps import LATEST_NS
 from sst_graph.types import CameraImage, Frame, Scan
-from sst_graph.validation import LATEST_NS, checked_frame, checked_guess, checked_intrinsics
+from sst_graph.validation import checked_frame, checked_guess, checked_intrinsics
 
 _LOG = logging.getLogger(__name__)
 
