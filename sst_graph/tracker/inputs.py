@@ -118,8 +118,14 @@ class SensorInputs:
         self._forget_images(estimate)
         self.first_frames.add(image)
 
-    def add_scan(self, scan: Scan, clock_step_ns: int, estimate: OnlineEstimate) -> Jump | None:
-        """Put a checked scan's boundary points and motion into the window; a jump of the stamps, if any."""
+    def add_scan(
+        self, scan: Scan, clock_step_ns: int, estimate: OnlineEstimate, frame: int | None = None
+    ) -> Jump | None:
+        """Put a checked scan's boundary points and motion into the window; a jump of the stamps, if any.
+
+        Args:
+            frame: its number in the drive; None: scans are counted as they come.
+        """
         self.scan_order.add(scan.stamp_ns, clock_step_ns != 0)
         if clock_step_ns:
             self.restart()
@@ -129,9 +135,8 @@ class SensorInputs:
         used = calibration.lower_edges != "never"
         by_geometry = calibration.method == "edges"
         labelled = labelled_by_geometry(scan) if by_geometry else scan
-        features = scan_features(
-            self.window.next_scan, labelled, calibration.classes, prepare, with_lower_edges=used
-        )
+        index = self.window.next_scan if frame is None else frame
+        features = scan_features(index, labelled, calibration.classes, prepare, with_lower_edges=used)
         self.window.add_scan(features, self.odometry.add(labelled))
         self.last_scan = scan
         self._forget_images(estimate)

@@ -118,14 +118,18 @@ class Tracker:
         except Exception as error:
             return self._not_added("image", image, error)
 
-    def add_scan(self, scan: Scan) -> TrackUpdate:
-        """Add a scan, and estimate; where anything fails, everything is as it was."""
+    def add_scan(self, scan: Scan, frame: int | None = None) -> TrackUpdate:
+        """Add a scan, and estimate; where anything fails, everything is as it was.
+
+        Args:
+            frame: its number in the drive, by which the result names it; None: scans are counted as they come.
+        """
         try:
             # 1. Check the scan and its stamp.
             checked, clock_step_ns = self.inputs.check_scan(scan)
             with Snapshot(self):
                 # 2. Its boundary points, and the motion that led to it, go into the window.
-                jump = self.inputs.add_scan(checked, clock_step_ns, self.estimate)
+                jump = self.inputs.add_scan(checked, clock_step_ns, self.estimate, frame)
                 # 3. Restart where stamps jumped: earlier frames have another time offset.
                 if restart := self._restart_by_stamps(clock_step_ns, jump):
                     return self._restart(restart, checked.stamp_ns)
@@ -238,7 +242,7 @@ class Tracker:
         if frame.scan is None:
             assert of_image is not None
             return of_image
-        update = self.add_scan(frame.scan)
+        update = self.add_scan(frame.scan, frame.index)
         if of_image is None or of_image.accepted:
             return update
         reason = "; ".join(filter(None, (of_image.reason, update.reason)))

@@ -74,6 +74,19 @@ def test_the_result_has_the_information_of_each_scan(running: Path) -> None:
     np.testing.assert_allclose(rest[-1].values, current_update(tracker).sigmas, rtol=1e-3)
 
 
+def test_a_result_names_frames_by_their_numbers_in_the_drive(
+    street: SimulatedDrive, frames: list[Frame]
+) -> None:
+    """Of a drive from its fifth frame on, as the lines of each frame do, and calibrate."""
+    tracker = tracker_from_truth(street)
+    updates = [tracker.add(frame) for frame in frames[5:20]]
+    result = tracker.result("drive")
+    used = {one.frame for one in result.frames_used}
+    assert used <= set(range(5, 20)) and max(used) == updates[-1].frame == 19
+    gained = gained_of(result)
+    assert gained is not None and gained.gains[-1].frame.frame == 19
+
+
 def test_what_leaves_the_window_still_counts(street: SimulatedDrive, frames: list[Frame]) -> None:
     whole, short = (
         tracker_from_truth(street),
