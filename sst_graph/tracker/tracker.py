@@ -12,7 +12,7 @@ import numpy as np
 from sst_graph.config import expect_settings
 from sst_graph.drive.stamp_intervals import Jump
 from sst_graph.errors import DataError, EstimationError
-from sst_graph.factors.arguments import checked_type
+from sst_graph.factors.arguments import checked_count, checked_type
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.odometry.sweep import SweepDecision
 from sst_graph.result import UNNAMED_CAMERA, CalibrationResult
@@ -160,7 +160,11 @@ class Tracker:
 
         Returns:
             The last frame's update with the solution; ``converged`` says whether it converged.
+
+        Raises:
+            FactorError: a number of iterations that is none.
         """
+        checked_count("max_iterations", max_iterations)
         at_end = not self.estimate.exists and self._finish_start()
         converged = self.estimate.optimize(max_iterations)
         self.monitor.changes.statistic.softness = self.estimate.softness
