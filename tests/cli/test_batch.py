@@ -202,6 +202,12 @@ def test_on_dask(drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
         (["--set", "nothing=1"], "nothing"),
         (["--init", "nowhere.json"], "nowhere.json"),
         (["--classes", "cow"], "cow"),
+        (["--frames", "x"], "frames 'x'"),
+        (["--frames", "7:3"], "frames 7:3"),
+        (["--loader", "rosbagg"], "rosbagg"),
+        (["--sweep-start-deg", "1e9"], "sweep start"),
+        (["--labels", "nowhere"], "--labels nowhere: found no file or folder"),
+        (["--image-model", "nowhere.onnx"], "--image-model nowhere.onnx: found no file or folder"),
         (["--method", "none"], "--method"),
     ],
 )

@@ -14,6 +14,7 @@ from sst_graph.cli.commands.batch.progress import ProgressOnStderr
 from sst_graph.cli.inputs import calibration_settings
 from sst_graph.cli.messages import complain, mention
 from sst_graph.cli.options import SOURCE_DEFAULTS
+from sst_graph.cli.reading import check_options
 from sst_graph.errors import ConfigError, count_of
 from sst_graph.fleet import (
     BatchConfig,
@@ -106,6 +107,7 @@ def _passed_on(args: argparse.Namespace) -> tuple[str, ...]:
 def _check_passed_on(args: argparse.Namespace) -> None:
     """Refuse at once what every drive would refuse."""
     calibration_settings(args)
+    check_options(args)
     if args.init not in ("dataset", "none"):
         load_initial(Path(args.init), args.camera or str(SOURCE_DEFAULTS["camera"]))
 
