@@ -37,9 +37,7 @@ def parse_seconds(text: str, place: str | Path) -> int:
         raise DataError(place, f"{text!r:.60}", "a number of seconds")
     seconds = Decimal(text)
     # By the exponent first: arithmetic with 1e999999999 overflows.
-    stamp_ns = (
-        None if seconds.adjusted() > _MAX_EXPONENT else int((seconds * NS_PER_S).to_integral_value())
-    )
+    stamp_ns = None if seconds.adjusted() > _MAX_EXPONENT else int((seconds * NS_PER_S).to_integral_value())
     if stamp_ns is None or abs(stamp_ns) > LATEST_NS:
         raise DataError(place, f"{text!r:.60}", f"seconds, at most {LATEST_NS // NS_PER_S} (146 years)")
     return stamp_ns

@@ -59,8 +59,9 @@ class Drive:
 def find_drives(what: str, name_parts: int = 1) -> list[Drive]:
     """The drives that a folder, a pattern or a list names, in the order of the list or of their names.
 
-    A list is a text file with one path or URL a line (# after a blank begins a comment), or a CSV with a column ``drive``
-    and any of ``name``, ``vehicle`` and ``date``. Paths in it are relative to where the program was started.
+    A list is a text file with one path or URL a line (# after a blank begins a comment), or a CSV with a
+    column ``drive`` and any of ``name``, ``vehicle`` and ``date``. Paths in it are relative to where the
+    program was started.
 
     Args:
         name_parts: how many of the last parts of a path make a drive's name.

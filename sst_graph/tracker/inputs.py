@@ -39,8 +39,10 @@ _SEARCH_MARGIN_S = 1.0
 
 def _with_own_arrays(data: _Data) -> _Data:
     """A scan or an image that is kept: the caller may fill its arrays anew, as drivers do."""
-    arrays = {name: value for name, value in vars(data).items() if isinstance(value, np.ndarray)}
-    return dataclasses.replace(data, **{name: value.copy() for name, value in arrays.items()})
+    arrays: dict[str, Any] = {
+        name: value.copy() for name, value in vars(data).items() if isinstance(value, np.ndarray)
+    }
+    return dataclasses.replace(data, **arrays)
 
 
 class SensorInputs:

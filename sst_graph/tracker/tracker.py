@@ -16,6 +16,7 @@ from sst_graph.factors.arguments import checked_count, checked_type
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.odometry.sweep import SweepDecision
 from sst_graph.result import UNNAMED_CAMERA, CalibrationResult
+from sst_graph.timestamps import LATEST_NS
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.estimate import FrameMatches, OnlineEstimate
 from sst_graph.tracker.inputs import SensorInputs
@@ -37,7 +38,6 @@ from sst_graph.tracker.storage.resume import Setup
 from sst_graph.tracker.storage.snapshot import Snapshot
 from sst_graph.tracker.track_update import Sensor, TrackUpdate
 from sst_graph.tracker.window.matcher import WindowMatcher
-from sst_graph.timestamps import LATEST_NS
 from sst_graph.types import CameraImage, Frame, Scan
 from sst_graph.validation import checked_frame, checked_guess, checked_intrinsics
 
@@ -122,7 +122,7 @@ class Tracker:
         """Add a scan, and estimate; where anything fails, everything is as it was.
 
         Args:
-            frame: its number in the drive, by which the result names it; None: scans are counted as they come.
+            frame: its number in the drive, by which the result names it; None: scans are counted.
         """
         try:
             # 1. Check the scan and its stamp.

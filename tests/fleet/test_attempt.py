@@ -159,5 +159,5 @@ def test_a_relative_path_means_the_same_data_from_every_folder(
         done = run_batch([Drive("d1", Place(drive))], out, BatchConfig(), lambda progress: None, run)
     assert done["d1"].place == str(tmp_path / "week1/drives/d1")
     monkeypatch.chdir(tmp_path / "week2")
-    with pytest.raises(ConfigError, match="week2/drives/d1: found a result of .*week1/drives/d1"):
+    with pytest.raises(ConfigError, match=r"week2/drives/d1: found a result of .*week1/drives/d1"):
         run_batch([Drive("d1", Place("drives/d1"))], out, BatchConfig(), lambda progress: None, refused)

@@ -110,7 +110,7 @@ def test_objects_without_a_velocity() -> None:
 
 @pytest.mark.parametrize("period_ns", [100, 60_000])
 def test_stamps_of_a_clock_that_hardly_runs(period_ns: int) -> None:
-    """Milliseconds that were divided by a million: scans within a millisecond of each other show no velocity."""
+    """Milliseconds divided by a million: scans within a millisecond of each other show no velocity."""
     velocities = _followed(-9.0, 8.0, period_ns=period_ns)
     velocities.update_all()
     assert all(velocities.of(k, NAME) is None for k in range(12))

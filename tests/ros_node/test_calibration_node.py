@@ -258,7 +258,7 @@ def test_a_start_is_of_the_node_s_camera_whatever_its_name(tmp_path: Path) -> No
     start = {"T_camera_lidar": np.eye(4).tolist(), "time_offset_s": 0.01, "camera": {"name": "/cam1/image"}}
     (tmp_path / "calibration.json").write_text(json.dumps(start))
     CalibrationNode(dataclasses.replace(SETTINGS, init=str(tmp_path / "calibration.json")))
-    with pytest.raises(DataError, match="nowhere.json"):
+    with pytest.raises(DataError, match=r"nowhere\.json"):
         CalibrationNode(dataclasses.replace(SETTINGS, init=str(tmp_path / "nowhere.json")))
 
 

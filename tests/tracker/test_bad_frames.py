@@ -298,7 +298,6 @@ def test_arrays_may_be_filled_anew(
     assert (tmp_path / "apart").read_bytes() == (tmp_path / "refilling").read_bytes()
 
 
-
 def test_one_slip_of_a_clock_is_refused_and_a_clock_that_was_set_is_not(
     running: Path, frames: list[Frame]
 ) -> None:
