@@ -38,6 +38,7 @@ BATCH = "batch.json"
 FORMAT = "sst-graph/batch"
 VERSION = 1
 LOCK = ".sst-graph-batch.lock"
+VEHICLES = "vehicles"
 
 _NAME_FILES = ("--config", "--init", "--image-model", "--lidar-model")
 _OPTION_FILE = FileKind("a file that an option names", 2**36)
@@ -217,6 +218,8 @@ def write_summary(
 ) -> Outcome:
     """Fuse the vehicles and write the summary: tables and page.
 
+    Files of an earlier summary that this one has not, such as those of vehicles, are removed.
+
     Raises:
         OSError, DataError: it cannot be written.
     """
@@ -232,13 +235,16 @@ def write_summary(
     }
     written = [name for name, data in contents.items() if data is not None]
     for name, data in contents.items():
-        if data is not None:
+        if data is None:
+            (out / name).remove()
+        else:
             (out / name).write(data)
-    names = vehicle_files(vehicle.name for vehicle in vehicles)
+    names, folder = vehicle_files(vehicle.name for vehicle in vehicles), out / VEHICLES
     for vehicle in vehicles:
-        (out / "vehicles" / names[vehicle.name]).write(
-            vehicle_json(vehicle, records, config.walk).encode("utf-8")
-        )
+        (folder / names[vehicle.name]).write(vehicle_json(vehicle, records, config.walk).encode("utf-8"))
+    for earlier in folder.below() if folder.is_folder() else []:
+        if earlier.name.endswith(".json") and earlier.name not in names.values():
+            earlier.remove()
     return Outcome(rows, vehicles, written)
 
 
