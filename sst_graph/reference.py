@@ -8,8 +8,9 @@ from sst_graph.imports import ImportOptions, import_calibration
 from sst_graph.types import Calibration, GroundTruth
 
 
-def read_reference(path: Path, camera: str = "image_2") -> GroundTruth:
-    """The calibration of ``camera`` in a file; its format is recognized by the contents.
+def read_reference(path: Path, camera: str | None = "image_2") -> GroundTruth:
+    """The calibration of ``camera`` (None: of the only one) in a file; its format is recognized by the
+    contents.
 
     The offset is the file's [s], where it says one; a KITTI ``calib.txt`` has none.
 
@@ -23,7 +24,7 @@ def read_reference(path: Path, camera: str = "image_2") -> GroundTruth:
     return GroundTruth(imported.cTl, imported.time_offset_s)
 
 
-def load_initial(path: Path, camera: str = "image_2") -> Calibration:
+def load_initial(path: Path, camera: str | None = "image_2") -> Calibration:
     """Start of a calibration from a file; the time offset is 0 where the file has none.
 
     Raises:

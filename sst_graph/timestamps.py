@@ -19,6 +19,9 @@ MAX_LENGTH = 64
 MAX_STAMPS = 2_000_000
 """Of a drive: more than a day at 20 Hz."""
 
+LATEST_NS = 2**62
+"""Stamps lie within +-146 years of zero, so that no difference of two leaves int64 [ns]."""
+
 _DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,9})?", re.ASCII)
 _MAX_EXPONENT = 10
 
@@ -27,16 +30,28 @@ def parse_seconds(text: str, place: str | Path) -> int:
     """Nanoseconds of a decimal number of seconds, exact (no detour over binary floats).
 
     Raises:
-        DataError: the text is no finite number, or does not fit into int64 nanoseconds.
+        DataError: the text is no finite number, or beyond :data:`LATEST_NS`.
     """
     text = text.strip()
     if len(text) > MAX_LENGTH or not _DECIMAL.fullmatch(text):
         raise DataError(place, f"{text!r:.60}", "a number of seconds")
     seconds = Decimal(text)
     # By the exponent first: arithmetic with 1e999999999 overflows.
-    if seconds.adjusted() > _MAX_EXPONENT or abs(seconds) > Decimal(2**63 - 1) / NS_PER_S:
-        raise DataError(place, f"{text!r:.60}", "seconds that fit into 64 bits as nanoseconds")
-    return int((seconds * NS_PER_S).to_integral_value())
+    stamp_ns = None if seconds.adjusted() > _MAX_EXPONENT else int((seconds * NS_PER_S).to_integral_value())
+    if stamp_ns is None or abs(stamp_ns) > LATEST_NS:
+        raise DataError(place, f"{text!r:.60}", f"seconds, at most {LATEST_NS // NS_PER_S} (146 years)")
+    return stamp_ns
+
+
+def checked_ns(stamp_ns: int, place: str | Path) -> int:
+    """A stamp [ns] that a clock shows.
+
+    Raises:
+        DataError: one beyond :data:`LATEST_NS`.
+    """
+    if abs(stamp_ns) > LATEST_NS:
+        raise DataError(place, f"a stamp of {stamp_ns} ns", f"nanoseconds, at most {LATEST_NS} (146 years)")
+    return stamp_ns
 
 
 def check_rising(stamps_ns: NDArray[np.int64], place: str | Path) -> None:

@@ -18,6 +18,7 @@ from sst_graph.errors import DataError, count_of
 from sst_graph.factors.arguments import described, masked_values
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.files.checked_values import checked_pose, checked_time_offset_s, pinhole_camera
+from sst_graph.timestamps import LATEST_NS
 from sst_graph.types import NO_PICTURE, CameraImage, Frame, PixelStretch, Scan, SemanticClass
 
 MOST_POINTS = 10_000_000
@@ -26,8 +27,6 @@ FARTHEST_M = 1e5
 """No LiDAR sees farther; a larger coordinate is another unit or a broken packet [m]."""
 LONGEST_SWEEP_S = 2.0
 """Times of points are relative to the scan's stamp; a larger one is an absolute time [s]."""
-LATEST_NS = 2**62
-"""Stamps lie within +-146 years of zero, so that no difference of two leaves int64 [ns]."""
 
 MOST_STRETCH = 1e6
 """No lens enlarges pixels more where an image is rectified."""

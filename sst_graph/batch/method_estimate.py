@@ -124,7 +124,7 @@ def result_of(
         initial=guess.cTl,
         initial_time_offset_s=guess.time_offset_s,
         diagnostics={**estimate.diagnostics, **_qualities(estimate), **sweeps_of(drives)},
-        versions=_versions(),
+        versions=package_versions(),
         fit=estimate.fit,
         edges_fit=estimate.edges_fit,
     )
@@ -208,11 +208,11 @@ def guess_as_result(
         config=to_dict(config),
         initial=guess.cTl,
         initial_time_offset_s=guess.time_offset_s,
-        versions=_versions(),
+        versions=package_versions(),
     )
 
 
-def _versions() -> dict[str, str]:
+def package_versions() -> dict[str, str]:
     """Of what took part; OpenCV's by the module, for four distributions bring it."""
     return {**{name: _version(name) for name in PACKAGES}, "opencv": str(cv2.__version__)}
 

@@ -76,10 +76,10 @@ def _written(
     pictures, frames = [], []
     progress(0, PICTURES + 1)
     read = [with_sweep_of(source, result.diagnostics) for source in sources]
-    for source, swept in zip(sources, read, strict=True):
+    for source, swept, plain in zip(sources, read, _file_names(sources), strict=True):
         drive = RecentReader(swept)
         for position in telling_positions(drive, result, max(1, PICTURES // len(sources))):
-            name = f"overlay_{_file_name(source.name)}_{drive.number(position):06d}.png"
+            name = f"overlay_{plain}_{drive.number(position):06d}.png"
             shown = ShownFrame.of(drive, position, result)
             (folder / name).write_bytes(png(overlay(shown, result, placement_before(result, source))))
             if with_report and result.fit is None:  # else the report chooses by the fit
@@ -134,5 +134,14 @@ def placement_before(result: CalibrationResult, source: Source) -> Placement | N
     return None if source.nominal is None else Placement(source.nominal, 0.0, "before (nominal)")
 
 
-def _file_name(name: str) -> str:
-    return re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")
+def _file_names(sources: Sequence[Source]) -> list[str]:
+    """A part of a file's name for each drive: letters and digits of its name, and a number where two are
+    alike."""
+    found: list[str] = []
+    for source in sources:
+        plain = re.sub(r"[\W_]+", "_", source.name).strip("_")
+        free, number = plain, 2
+        while free in found:
+            free, number = f"{plain}_{number}", number + 1
+        found.append(free)
+    return found

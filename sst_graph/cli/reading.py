@@ -18,6 +18,7 @@ from sst_graph.cli.messages import complain
 from sst_graph.cli.options import SOURCE_DEFAULTS
 from sst_graph.data import open_source
 from sst_graph.data.info.facts import FactsReader
+from sst_graph.data.source import source_options
 from sst_graph.errors import ConfigError, DataError, SstGraphError
 from sst_graph.files.typed_values import matches
 from sst_graph.result import CalibrationResult, result_file
@@ -103,10 +104,27 @@ def reading_words(read_as: Mapping[str, Any]) -> str:
     )
 
 
+def check_options(args: argparse.Namespace) -> None:
+    """Refuse at once what no drive can be read with.
+
+    Raises:
+        ConfigError: an option out of range, or a file or folder that is not there.
+    """
+    options = options_of(argparse.Namespace(**vars(args)))
+    source_options(**_of_drive(options))
+    for name in LABEL_OPTIONS:
+        if options[name] is not None and not _is_here(options[name]):
+            raise ConfigError(f"{_flag(name)} {options[name]}: found no file or folder")
+
+
 def _opened(path: Path, options: Mapping[str, Any]) -> Source:
     """The drive at a path, with labels by networks where the options ask for them."""
-    drive = {name: value for name, value in options.items() if name not in LABEL_OPTIONS}
-    return labelled(open_source(path, **drive), options)
+    return labelled(open_source(path, **_of_drive(options)), options)
+
+
+def _of_drive(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Without those of labels."""
+    return {name: value for name, value in options.items() if name not in LABEL_OPTIONS}
 
 
 def _is_here(place: Any) -> bool:

@@ -26,7 +26,7 @@ from sst_graph.errors import ConfigError, count_of
 from sst_graph.files import atomic_directory
 from sst_graph.files.strict_json import strict_json
 from sst_graph.inspect.report import Comparison, summary
-from sst_graph.result import RIG_NAME, CalibrationResult
+from sst_graph.result import RIG_NAME, CalibrationResult, result_file
 from sst_graph.rig import KnownPose, KnownRig, RelativePose, RigResult, calibrate_rig, read_rig
 from sst_graph.rig.known import ROTATION_SIGMA_DEG, TRANSLATION_SIGMA_M, poses_by_nominal
 from sst_graph.rig.known_files import read_known_poses
@@ -191,9 +191,13 @@ def _opened(
 def _starts(
     choice: str, sources: Mapping[str, Sequence[Source]], read_as: Mapping[str, Mapping[str, Any]]
 ) -> tuple[dict[str, gtsam.Pose3 | None], dict[str, float]]:
-    """cTl and time offset [s] of each camera that ``--init`` asks for; a rig's result has those of each."""
-    path = Path(choice)
-    if choice not in ("dataset", "none") and (path.is_dir() or path.name == RIG_NAME):
+    """cTl and time offset [s] of each camera that ``--init`` asks for; a rig's result has those of each.
+
+    Raises:
+        ConfigError: a file that has one pose for two cameras.
+    """
+    path, is_file = Path(choice), choice not in ("dataset", "none")
+    if is_file and (path.name == RIG_NAME or (path.is_dir() and not result_file(path).exists())):
         rig = read_rig(path)
         results = {name: rig[name] for name in sources}
         return (
@@ -204,7 +208,17 @@ def _starts(
     for name, own in sources.items():
         warn_of_other_pairs(choice, read_as[name])
         initial[name], offsets_s[name] = starting_point(choice, own[0], name)
+        same = [one for one in initial if one != name and _is_same(initial[one], initial[name])]
+        if is_file and same:
+            raise ConfigError(
+                f"--init {choice}: found one pose for {same[0]} and {name}, expected one of each camera "
+                "(the folder of a rig, or a file that names both)"
+            )
     return initial, offsets_s
+
+
+def _is_same(a: gtsam.Pose3 | None, b: gtsam.Pose3 | None) -> bool:
+    return a is not None and b is not None and a.equals(b, 0.0)
 
 
 def _known_poses(

@@ -235,13 +235,7 @@ def open_source(
         DataError: nothing there, or data that cannot be used.
         ConfigError: an option that is unknown or out of range.
     """
-    if not isinstance(loader, str):
-        raise ConfigError(f"loader: found {described(loader)}, expected the name of a format")
-    unknown = [name for name in options if name not in ReadOptions.__annotations__]
-    if unknown:
-        known = ", ".join(("loader", "frames", *ReadOptions.__annotations__))
-        raise ConfigError(f"option {unknown[0]!r:.60}: expected one of {known}")
-    chosen = SourceOptions(frames=parse_frames(frames) if isinstance(frames, str) else frames, **options)
+    chosen = source_options(loader, frames, **options)
     path = path_of(path, "a drive")
     if loader != "auto":
         return find_loader(loader).opened(path, chosen)
@@ -258,6 +252,25 @@ def open_source(
             return candidate.opened(path, chosen)
         layouts.append(candidate.layout)
     raise DataError(path, "no layout that is known", "; or ".join(layouts))
+
+
+def source_options(
+    loader: str = "auto", frames: str | slice | None = None, **options: Unpack[ReadOptions]
+) -> SourceOptions:
+    """Options of :func:`open_source`, whatever the drive.
+
+    Raises:
+        ConfigError: one that is unknown or out of range.
+    """
+    if not isinstance(loader, str):
+        raise ConfigError(f"loader: found {described(loader)}, expected the name of a format")
+    if loader != "auto":
+        find_loader(loader)
+    unknown = [name for name in options if name not in ReadOptions.__annotations__]
+    if unknown:
+        known = ", ".join(("loader", "frames", *ReadOptions.__annotations__))
+        raise ConfigError(f"option {unknown[0]!r:.60}: expected one of {known}")
+    return SourceOptions(frames=parse_frames(frames) if isinstance(frames, str) else frames, **options)
 
 
 def parse_frames(text: str) -> slice:

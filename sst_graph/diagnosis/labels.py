@@ -37,6 +37,12 @@ def searched_classes(drives: Sequence[Drive], classes: Sequence[SemanticClass]) 
         ),
     ):
         present = {c for counts in labelled for c in counts}
+        if labelled and present <= {int(SemanticClass.IGNORE)}:
+            return Finding(
+                f"no {what} has a label",
+                f"{names} cannot be aligned",
+                "say where the labels are, make them by networks, or take --method edges, which needs none",
+            )
         if labelled and not present & {int(c) for c in classes}:
             return Finding(
                 f"no {what} is labelled {names}",

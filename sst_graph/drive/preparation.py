@@ -478,7 +478,10 @@ def _sample(scan: Scan) -> NDArray[np.intp]:
 def image_features(
     index: int, image: CameraImage, classes: Sequence[SemanticClass], use_picture: bool = True
 ) -> ImageFeatures:
-    """Mask and contours of an image; ``use_picture``: the contours follow its picture."""
+    """Mask and contours of an image; ``use_picture``: the contours follow its picture.
+
+    The mask is a copy: the image's arrays may be filled anew, as a driver's are.
+    """
     picture = image.pixels if use_picture else None
     fields = {
         c: ContourMap.of(image.mask, c, picture, valid=image.valid, stretch=image.stretch)
@@ -490,4 +493,4 @@ def image_features(
     }
     if SemanticClass.OBJECT in classes and image.has_picture:
         contours[SemanticClass.OBJECT] = PictureGradients.of(image.pixels, image.valid)
-    return ImageFeatures(index, image.stamp_ns, image.mask, contours)
+    return ImageFeatures(index, image.stamp_ns, image.mask.copy(), contours)

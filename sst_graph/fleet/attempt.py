@@ -55,6 +55,11 @@ class Job:
     retries: int = 0
 
     @property
+    def place(self) -> str:
+        """Where the drive's data stand, in words that mean the same wherever the program is started."""
+        return self.drive.place.whole(self.folder)
+
+    @property
     def result(self) -> Place:
         """Folder of the drive's result."""
         return self.out / DRIVES / self.drive.name
@@ -74,7 +79,7 @@ def run_drive(job: Job) -> Record:
     attempts = kills = 0
     while record is None or _is_to_be_repeated(record.status, attempts - kills - 1 < job.retries, kills):
         if has_ended():
-            return Record(job.drive.name, job.drive.place.url, "not_run", "the batch was ended before")
+            return Record(job.drive.name, job.place, "not_run", "the batch was ended before")
         attempts += 1
         record = _attempt(job)
         kills += record.status == "killed"
@@ -106,7 +111,7 @@ def finished_record(job: Job, stored: bytes | None = None) -> Record | None:
             record = Record.from_json(job.record.read() if stored is None else stored, job.record.url)
             if (
                 record.has_result
-                and record.place == job.drive.place.url
+                and Place(record.place).whole(job.folder) == job.place
                 and _is_whole(job, stored is not None)
             ):
                 return record
@@ -157,7 +162,7 @@ def _attempt(job: Job) -> Record:
 def _data(job: Job, scratch: Path) -> Path:
     """The drive's data on this machine."""
     if job.drive.place.is_local:
-        return Path(job.folder) / job.drive.place.path
+        return Path(job.place)
     (scratch / "data").mkdir()
     return job.drive.place.fetch(scratch / "data")
 
@@ -214,12 +219,12 @@ def _of_result(job: Job, folder: Path) -> Record | None:
         result = read_result(folder / RESULT)
     except DataError:
         return None
-    record = Record(job.drive.name, job.drive.place.url, result.status, reason_of(result))
+    record = Record(job.drive.name, job.place, result.status, reason_of(result))
     return replace(record, numbers=Numbers.of(result))
 
 
 def _failed(job: Job, status: Status, reason: str) -> Record:
-    return Record(job.drive.name, job.drive.place.url, status, printable(reason, 1000))
+    return Record(job.drive.name, job.place, status, printable(reason, 1000))
 
 
 def _clean(target: Path) -> None:

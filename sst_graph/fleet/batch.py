@@ -9,19 +9,20 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from sst_graph.config import Settings, setting
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.files.json_table import json_table
-from sst_graph.files.reading import parse_json
+from sst_graph.files.reading import FileKind, digest_of_file, parse_json
 from sst_graph.files.staging import lock_file
 from sst_graph.files.strict_json import strict_json
 from sst_graph.fleet.attempt import DRIVES, RECORDS, Job, finished_record, run_drive
 from sst_graph.fleet.dask_pool import Cluster, run_on_dask
-from sst_graph.fleet.drives import Drive, file_name
+from sst_graph.fleet.drives import Drive, vehicle_files
 from sst_graph.fleet.isolated import Limits
 from sst_graph.fleet.local_pool import run_locally
 from sst_graph.fleet.places import Place, read_many
@@ -31,11 +32,16 @@ from sst_graph.fleet.summary.page import summary_html
 from sst_graph.fleet.summary.tables import Row, csv_bytes, drive_rows, parquet_bytes, vehicle_rows
 from sst_graph.fleet.vehicles.fused import Vehicle, vehicle_json, vehicles_of
 from sst_graph.fleet.vehicles.walk import WalkConfig
+from sst_graph.result import result_file
 
 BATCH = "batch.json"
 FORMAT = "sst-graph/batch"
 VERSION = 1
 LOCK = ".sst-graph-batch.lock"
+VEHICLES = "vehicles"
+
+_NAME_FILES = ("--config", "--init", "--image-model", "--lidar-model")
+_OPTION_FILE = FileKind("a file that an option names", 2**36)
 
 Told = Callable[["Progress"], None]
 
@@ -128,6 +134,7 @@ def open_batch(out: Place, options: Sequence[str]) -> Iterator[None]:
             parse_json(_utf8((out / BATCH).read(), place), place, BATCH), place, FORMAT, VERSION
         )
         before = [str(one) for one in table.sequence("options")]
+        _check_files(out, table.mapping("files"), options)
         if before != list(options):
             raise ConfigError(
                 f"{out}: was begun with the options {' '.join(before) or '(none)'}, found "
@@ -140,10 +147,35 @@ def open_batch(out: Place, options: Sequence[str]) -> Iterator[None]:
         )
     with _locked(out):
         if not (out / BATCH).exists():
-            document = {"format": FORMAT, "version": VERSION, "options": list(options)}
+            document = {
+                "format": FORMAT,
+                "version": VERSION,
+                "options": list(options),
+                "files": _digests(options),
+            }
             (out / BATCH).write((strict_json(document) + "\n").encode("utf-8"))
         sweep_scratch()
         yield
+
+
+def _digests(options: Sequence[str]) -> dict[str, str]:
+    """SHA-256 of the files that options name, by option."""
+    found = {}
+    for option in options:
+        name, _, value = option.partition("=")
+        path = result_file(Path(value))
+        if name in _NAME_FILES and path.is_file():
+            found[option] = digest_of_file(path, _OPTION_FILE).hex()
+    return found
+
+
+def _check_files(out: Place, before: Mapping[str, object], options: Sequence[str]) -> None:
+    """Refuse a file that is another one than when the batch was begun: results of both would be mixed."""
+    for option, digest in _digests(options).items():
+        if before.get(option, digest) != digest:
+            raise ConfigError(
+                f"{out}: was begun with other contents of {option}, expected the same (or another --out)"
+            )
 
 
 def run_batch(
@@ -186,6 +218,8 @@ def write_summary(
 ) -> Outcome:
     """Fuse the vehicles and write the summary: tables and page.
 
+    Files of an earlier summary that this one has not, such as those of vehicles, are removed.
+
     Raises:
         OSError, DataError: it cannot be written.
     """
@@ -201,26 +235,17 @@ def write_summary(
     }
     written = [name for name, data in contents.items() if data is not None]
     for name, data in contents.items():
-        if data is not None:
+        if data is None:
+            (out / name).remove()
+        else:
             (out / name).write(data)
-    names = _vehicle_files(vehicles)
+    names, folder = vehicle_files(vehicle.name for vehicle in vehicles), out / VEHICLES
     for vehicle in vehicles:
-        (out / "vehicles" / names[vehicle.name]).write(
-            vehicle_json(vehicle, records, config.walk).encode("utf-8")
-        )
+        (folder / names[vehicle.name]).write(vehicle_json(vehicle, records, config.walk).encode("utf-8"))
+    for earlier in folder.below() if folder.is_folder() else []:
+        if earlier.name.endswith(".json") and earlier.name not in names.values():
+            earlier.remove()
     return Outcome(rows, vehicles, written)
-
-
-def _vehicle_files(vehicles: Sequence[Vehicle]) -> dict[str, str]:
-    """A file's name for each vehicle."""
-    files: dict[str, str] = {}
-    for vehicle in vehicles:
-        name = f"{file_name(vehicle.name)}.json"
-        if name in files.values():
-            other = next(one for one, taken in files.items() if taken == name)
-            raise ConfigError(f"vehicles {other!r} and {vehicle.name!r}: found one file {name} for both")
-        files[vehicle.name] = name
-    return files
 
 
 def _finished(jobs: Sequence[Job], out: Place) -> dict[str, Record]:
@@ -248,9 +273,9 @@ def _check_same(job: Job, data: bytes | None) -> None:
         before = Record.from_json(data, job.record.url)
     except DataError:
         return  # it is written anew
-    if before.has_result and before.place != job.drive.place.url:
+    if before.has_result and Place(before.place).whole(job.folder) != job.place:
         raise ConfigError(
-            f"{job.drive.place}: found a result of {before.place} under the name {job.drive.name}, "
+            f"{job.place}: found a result of {before.place} under the name {job.drive.name}, "
             "expected one of the same data (names differ with --name-parts 2, or another --out)"
         )
 

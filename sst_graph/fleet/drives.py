@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import re
+import unicodedata
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,9 +14,10 @@ from datetime import UTC, datetime
 from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.fleet.places import Place
 
-_NOT_IN_A_NAME = re.compile(r"[^A-Za-z0-9._=+-]+")
+_NOT_IN_A_NAME = re.compile(r"[^\w.=+-]+")
 _PATTERN = re.compile(r"[*?\[]")
-_LONGEST_NAME = 150
+_COMMENT = re.compile(r"(^|\s)#.*")
+_LONGEST_NAME = 150  # bytes
 MOST_DRIVES = 1_000_000
 
 _DATES = (
@@ -57,14 +59,15 @@ class Drive:
 def find_drives(what: str, name_parts: int = 1) -> list[Drive]:
     """The drives that a folder, a pattern or a list names, in the order of the list or of their names.
 
-    A list is a text file with one path or URL a line (# begins a comment), or a CSV with a column ``drive``
-    and any of ``name``, ``vehicle`` and ``date``. Paths in it are relative to where the program was started.
+    A list is a text file with one path or URL a line (# after a blank begins a comment), or a CSV with a
+    column ``drive`` and any of ``name``, ``vehicle`` and ``date``. Paths in it are relative to where the
+    program was started.
 
     Args:
         name_parts: how many of the last parts of a path make a drive's name.
 
     Raises:
-        ConfigError: none are found, or two have the same name.
+        ConfigError: none are found, two have the same name, or two vehicles' files have one name.
         DataError: the list cannot be read.
     """
     if not what.strip():
@@ -84,6 +87,7 @@ def find_drives(what: str, name_parts: int = 1) -> list[Drive]:
     if len(drives) > MOST_DRIVES:
         raise ConfigError(f"{what}: found {count_of(len(drives), 'drive')}, expected at most {MOST_DRIVES}")
     _check_names(drives)
+    vehicle_files(drive.vehicle for drive in drives)
     return drives
 
 
@@ -96,33 +100,53 @@ def with_vehicles(drives: Sequence[Drive], given: str) -> list[Drive]:
             if its dates are in the paths, a group ``date``.
 
     Raises:
-        ConfigError: no such expression, or it fits no drive.
-        DataError: the CSV cannot be read.
+        ConfigError: no such expression, or it fits no drive; two vehicles whose files have one name.
+        DataError: the CSV cannot be read, or has two rows of one drive.
     """
     told = _by_table(given) if given.lower().endswith(".csv") else _by_expression(given)
     found = []
     for drive in drives:
         row = told(drive)
-        date = _checked_date(row.get("date") or drive.date, given)
+        date = _checked_date(row.get("date") or drive.date, f"--vehicle-from {given}: {drive.place}")
         found.append(replace(drive, vehicle=(row.get("vehicle") or drive.vehicle).strip(), date=date))
     if not any(drive.vehicle for drive in found):
         raise ConfigError(
             f"--vehicle-from {given}: found no vehicle of any of {count_of(len(found), 'drive')}"
         )
+    vehicle_files(drive.vehicle for drive in found)
     return found
 
 
 def file_name(words: str) -> str:
-    """Words as the name of a file: what may be trouble in one becomes an underscore."""
-    name = _NOT_IN_A_NAME.sub("_", words).strip("._") or "_"
-    return name[:_LONGEST_NAME]
+    """Words as the name of a file: what is no letter and no digit of any script becomes an underscore."""
+    name = _NOT_IN_A_NAME.sub("_", unicodedata.normalize("NFC", words)).strip("._") or "_"
+    return name.encode("utf-8")[:_LONGEST_NAME].decode("utf-8", "ignore")
+
+
+def vehicle_files(names: Iterable[str]) -> dict[str, str]:
+    """The name of a file for each vehicle; drives of no known one (an empty name) have none.
+
+    Raises:
+        ConfigError: one name for two of them.
+    """
+    owners: dict[str, str] = {}
+    for vehicle in sorted(set(names) - {""}):
+        name = f"{file_name(vehicle)}.json"
+        if owners.setdefault(name, vehicle) != vehicle:
+            raise ConfigError(f"vehicles {owners[name]!r} and {vehicle!r}: found one file {name} for both")
+    return {vehicle: name for name, vehicle in owners.items()}
 
 
 def _by_table(given: str) -> Callable[[Drive], Mapping[str, str | None]]:
-    known = {row["drive"].rstrip("/"): row for row in _rows(Place.of(given), ("drive", "vehicle"))}
+    known: dict[str, dict[str, str]] = {}
+    for row in _rows(Place.of(given), ("drive", "vehicle")):
+        place = Place.of(row["drive"])
+        for key in {place.url, place.whole()}:
+            if known.setdefault(key, row) != row:
+                raise DataError(given, f"two rows of the drive {row['drive']}", "one vehicle and one date")
 
     def told(drive: Drive) -> Mapping[str, str | None]:
-        return known.get(drive.name) or known.get(drive.place.url) or {}
+        return known.get(drive.name) or known.get(drive.place.whole()) or {}
 
     return told
 
@@ -152,11 +176,11 @@ def _of_list(place: Place, name_parts: int) -> list[Drive]:
         drives = []
         for row in _rows(place, ("drive",)):
             drive = _named(Place.of(row["drive"]), name_parts)
-            date = _checked_date(row.get("date", ""), place.url)
+            date = _checked_date(row.get("date", ""), f"{place}: {row['drive']}")
             name = file_name(row["name"]) if row.get("name") else drive.name
             drives.append(Drive(name, drive.place, row.get("vehicle", ""), date))
         return drives
-    lines = (line.partition("#")[0].strip() for line in _text(place).splitlines())
+    lines = (_COMMENT.sub("", line).strip() for line in _text(place).splitlines())
     return [_named(Place.of(line), name_parts) for line in lines if line]
 
 

@@ -48,6 +48,10 @@ class Place:
         """Last part of the path."""
         return self.url.rsplit("/", 1)[-1]
 
+    def whole(self, folder: str = "") -> str:
+        """The URL, or the path from the root; a relative one begins in a folder (the present one)."""
+        return os.path.abspath(os.path.join(folder, self.url)) if self.is_local else self.url
+
     @property
     def path(self) -> Path:
         """As a path of this machine."""

@@ -181,14 +181,15 @@ class ObjectVelocities:
 def _is_carried(
     w_velocity: FloatArray, outline: FloatArray, times_s: FloatArray, outlines: Sequence[FloatArray]
 ) -> bool:
-    """Whether an outline, moved with a velocity, is where the first and the last scan around show it."""
-    shares = []
+    """Whether an outline, moved with a velocity, is where the first and the last scan around show it.
+
+    Scans within a millisecond of its own show nothing.
+    """
+    others, shares = [i for i in (0, -1) if abs(times_s[i]) > 1e-3], []
+    if not others:
+        return False
     for velocity in (w_velocity, np.zeros(2)):
-        distances = [
-            cdist(outline + times_s[i] * velocity, outlines[i]).min(axis=1)
-            for i in (0, -1)
-            if abs(times_s[i]) > 1e-3
-        ]
+        distances = [cdist(outline + times_s[i] * velocity, outlines[i]).min(axis=1) for i in others]
         shares.append(float(np.mean(np.concatenate(distances) < _REACH_M)))
     return shares[0] >= max(_MIN_SHARE, shares[1] + _MIN_GAIN)
 

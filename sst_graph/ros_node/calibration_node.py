@@ -57,7 +57,8 @@ class CalibrationNode:
         self._encoding = MaskEncoding(settings.label_encoding)
         self._reading = _reading(settings)
         given = settings.init not in (INIT_TF, INIT_NONE)
-        self._given = load_initial(Path(settings.init)) if given else None
+        # A node has one camera, whose name in the data that the file was made of is another matter.
+        self._given = load_initial(Path(settings.init), None) if given else None
         self.camera = SensorRecord("camera", settings.image_topic)
         self.lidar = SensorRecord("lidar", settings.cloud_topic)
         self.masks = SensorRecord("masks", settings.mask_topic)
@@ -210,6 +211,7 @@ class CalibrationNode:
         self._rectification = None if model.is_pinhole else Rectification.of(model)
         camera = model.intrinsics if self._rectification is None else self._rectification.camera
         self.tracker = Tracker(camera, self._config, initial, time_offset_s)
+        self._waiting_for = "no cloud could be used yet"
         return True
 
     def _geometry_of(self, first: Waiting) -> ImageGeometry:
@@ -234,7 +236,7 @@ class CalibrationNode:
         assert self.tracker is not None
         sensor = self.lidar if one.is_scan else self.camera
         try:
-            update = self.tracker.add(self._frame(one))
+            update = self.tracker.add(self._frame(one, now_ns))
         except Exception as error:
             sensor.refuse(_reason(error), now_ns)
             return None
@@ -244,14 +246,14 @@ class CalibrationNode:
             sensor.used += 1
         return update
 
-    def _frame(self, one: Waiting) -> Frame:
+    def _frame(self, one: Waiting, now_ns: int) -> Frame:
         """A message as a frame with one sensor, numbered as it came."""
         if not one.is_scan:
-            return Frame(one.number, None, self._image(one))
+            return Frame(one.number, None, self._image(one, now_ns))
         scan = scan_of(one.content, one.stamp_ns, self.lidar.topic, self._reading)
         return Frame(one.number, scan, None)
 
-    def _image(self, one: Waiting) -> CameraImage:
+    def _image(self, one: Waiting, now_ns: int) -> CameraImage:
         assert self._geometry is not None
         message, type_name = one.content["image"]
         model = self._geometry.model
@@ -261,7 +263,11 @@ class CalibrationNode:
         mask = np.full(pixels.shape[:2], SemanticClass.IGNORE, np.uint8)
         if "mask" in one.content:
             labels, labels_type = one.content["mask"]
-            mask = mask_classes(labels, labels_type, self._encoding, size, self.masks.topic)
+            try:
+                mask = mask_classes(labels, labels_type, self._encoding, size, self.masks.topic)
+            except Exception as error:
+                self.masks.refuse(_reason(error), now_ns)
+                raise
             self.masks.used += 1
         image = CameraImage(one.stamp_ns, mask, pixels)
         return image if self._rectification is None else self._rectification.image(image)

@@ -191,6 +191,8 @@ def _bonnetal_numbers(data: Mapping[str, Any], place: Path) -> LabelNumbers:
 
 def _described(path: Path, expected: str) -> Path:
     """The YAML file of a network: itself, or the one beside an ONNX file."""
+    if not os.path.lexists(path):
+        raise DataError(path, "no file or folder", expected)
     if path.suffix.lower() == ".onnx":
         for suffix in _YAML:
             if os.path.isfile(path.with_suffix(suffix)):
@@ -198,8 +200,6 @@ def _described(path: Path, expected: str) -> Path:
         raise DataError(
             path, f"no {path.stem}.yaml beside it", "a YAML file that says how the network is used"
         )
-    if not os.path.lexists(path):
-        raise DataError(path, "no file or folder", expected)
     if os.path.isdir(path) or path.suffix.lower() not in _YAML:
         raise DataError(path, "a folder" if os.path.isdir(path) else f"a file {path.suffix!r:.20}", expected)
     return path

@@ -113,7 +113,7 @@ class OnlineEstimate:
         self.schedule = RelinearizationSchedule(window.first_scan, soon, self.config.window)
         self.entered.extend(smoother.entries)
         self.information_log.restart()
-        self.information_log.add(window.next_scan - 1, self.reported_covariance())
+        self.information_log.add(window.scans[-1][1].index, self.reported_covariance())
         _LOG.info("tracker: started over %d scans", initialization.scans)
 
     def restart(self, guess: StartGuess) -> None:
@@ -255,7 +255,7 @@ class OnlineEstimate:
         # 3. Covariance, and what the scan contributed to it.
         self.uncertainty = Uncertainty.of(smoother)
         if new:
-            self.information_log.add(matches.scan, self.reported_covariance())
+            self.information_log.add(window.scans[-1][1].index, self.reported_covariance())
         # 4. Test the assumptions, and whether edges still agree with the pictures.
         self.tests.update(matches.scan, smoother)
         if self.edges is not None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from collections import deque
-from typing import Any
+from typing import Any, TypeVar
+
+import numpy as np
 
 from sst_graph.drive.geometric_labels import labelled_by_geometry
 from sst_graph.drive.preparation import TRACK_INTERVAL_S, image_features, scan_features
@@ -23,6 +25,8 @@ from sst_graph.tracker.window.window import Window
 from sst_graph.types import CameraImage, Scan
 from sst_graph.validation import checked_image, checked_scan
 
+_Data = TypeVar("_Data", Scan, CameraImage)
+
 _MAX_IMAGES = 600
 """Most images that are kept, for any number of them may come while no scan does: a minute at 10 Hz."""
 _MAX_EDGE_IMAGES = 100
@@ -31,6 +35,14 @@ _MAX_FAILURES = 10
 """Failures in a row after which the window is given up: it is then their likely cause."""
 _SEARCH_MARGIN_S = 1.0
 """Images farther from a scan are kept, too, until the time offset is known [s]."""
+
+
+def _with_own_arrays(data: _Data) -> _Data:
+    """A scan or an image that is kept: the caller may fill its arrays anew, as drivers do."""
+    arrays: dict[str, Any] = {
+        name: value.copy() for name, value in vars(data).items() if isinstance(value, np.ndarray)
+    }
+    return dataclasses.replace(data, **arrays)
 
 
 class SensorInputs:
@@ -78,7 +90,8 @@ class SensorInputs:
             DataError: it cannot be used.
         """
         checked = checked_image(image, self.camera)
-        return checked, self.image_order.check(checked.stamp_ns)
+        clock_step_ns = self.image_order.check(checked.stamp_ns)
+        return _with_own_arrays(checked), clock_step_ns
 
     def check_scan(self, scan: Scan) -> tuple[Scan, int]:
         """The scan as it may be used, and by how much its clock was set, 0 if it was not [ns].
@@ -87,7 +100,8 @@ class SensorInputs:
             DataError: it cannot be used.
         """
         checked = checked_scan(scan)
-        return checked, self.scan_order.check(checked.stamp_ns)
+        clock_step_ns = self.scan_order.check(checked.stamp_ns)
+        return _with_own_arrays(checked), clock_step_ns
 
     def add_image(self, image: CameraImage, clock_step_ns: int, estimate: OnlineEstimate) -> None:
         """Put a checked image's contours into the window.
@@ -106,8 +120,14 @@ class SensorInputs:
         self._forget_images(estimate)
         self.first_frames.add(image)
 
-    def add_scan(self, scan: Scan, clock_step_ns: int, estimate: OnlineEstimate) -> Jump | None:
-        """Put a checked scan's boundary points and motion into the window; a jump of the stamps, if any."""
+    def add_scan(
+        self, scan: Scan, clock_step_ns: int, estimate: OnlineEstimate, frame: int | None = None
+    ) -> Jump | None:
+        """Put a checked scan's boundary points and motion into the window; a jump of the stamps, if any.
+
+        Args:
+            frame: its number in the drive; None: scans are counted as they come.
+        """
         self.scan_order.add(scan.stamp_ns, clock_step_ns != 0)
         if clock_step_ns:
             self.restart()
@@ -117,9 +137,8 @@ class SensorInputs:
         used = calibration.lower_edges != "never"
         by_geometry = calibration.method == "edges"
         labelled = labelled_by_geometry(scan) if by_geometry else scan
-        features = scan_features(
-            self.window.next_scan, labelled, calibration.classes, prepare, with_lower_edges=used
-        )
+        index = self.window.next_scan if frame is None else frame
+        features = scan_features(index, labelled, calibration.classes, prepare, with_lower_edges=used)
         self.window.add_scan(features, self.odometry.add(labelled))
         self.last_scan = scan
         self._forget_images(estimate)

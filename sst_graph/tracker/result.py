@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sst_graph.batch.assumption_tests import assumption_report
+from sst_graph.batch.method_estimate import package_versions
 from sst_graph.config import to_dict
+from sst_graph.factors.arguments import checked_type
 from sst_graph.inspect.gained import KEY, to_document
 from sst_graph.result import UNNAMED_CAMERA, CalibrationResult, FrameId, Status
 from sst_graph.tracker.make_update import current_update
@@ -21,7 +23,12 @@ if TYPE_CHECKING:
 def tracker_result(
     tracker: Tracker, drive: str = "stream", camera_name: str = UNNAMED_CAMERA
 ) -> CalibrationResult:
-    """The present estimate as a result; frames used are those of the window."""
+    """The present estimate as a result; frames used are those of the window.
+
+    Raises:
+        FactorError: a name that is no text.
+    """
+    checked_type("drive", drive, str, "a text")
     last, estimate, window = current_update(tracker), tracker.estimate, tracker.inputs.window
     status: Status = "ok" if last.status == "ok" else "not_converged"
     reasons = tuple(f"{weak.sentence}: {weak.advice}" for weak in last.weak_directions)
@@ -69,6 +76,7 @@ def tracker_result(
             else {"side": model.side, "side_frame": model.side_frame, "match": model.match},
             **({} if config.drift.enabled else {KEY: to_document(estimate.information_log.gained(drive))}),
         },
+        versions=package_versions(),
     )
 
 

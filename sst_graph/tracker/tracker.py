@@ -12,10 +12,11 @@ import numpy as np
 from sst_graph.config import expect_settings
 from sst_graph.drive.stamp_intervals import Jump
 from sst_graph.errors import DataError, EstimationError
-from sst_graph.factors.arguments import checked_type
+from sst_graph.factors.arguments import checked_count, checked_type
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.odometry.sweep import SweepDecision
 from sst_graph.result import UNNAMED_CAMERA, CalibrationResult
+from sst_graph.timestamps import LATEST_NS
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.estimate import FrameMatches, OnlineEstimate
 from sst_graph.tracker.inputs import SensorInputs
@@ -38,7 +39,7 @@ from sst_graph.tracker.storage.snapshot import Snapshot
 from sst_graph.tracker.track_update import Sensor, TrackUpdate
 from sst_graph.tracker.window.matcher import WindowMatcher
 from sst_graph.types import CameraImage, Frame, Scan
-from sst_graph.validation import LATEST_NS, checked_frame, checked_guess, checked_intrinsics
+from sst_graph.validation import checked_frame, checked_guess, checked_intrinsics
 
 _LOG = logging.getLogger(__name__)
 
@@ -117,14 +118,18 @@ class Tracker:
         except Exception as error:
             return self._not_added("image", image, error)
 
-    def add_scan(self, scan: Scan) -> TrackUpdate:
-        """Add a scan, and estimate; where anything fails, everything is as it was."""
+    def add_scan(self, scan: Scan, frame: int | None = None) -> TrackUpdate:
+        """Add a scan, and estimate; where anything fails, everything is as it was.
+
+        Args:
+            frame: its number in the drive, by which the result names it; None: scans are counted.
+        """
         try:
             # 1. Check the scan and its stamp.
             checked, clock_step_ns = self.inputs.check_scan(scan)
             with Snapshot(self):
                 # 2. Its boundary points, and the motion that led to it, go into the window.
-                jump = self.inputs.add_scan(checked, clock_step_ns, self.estimate)
+                jump = self.inputs.add_scan(checked, clock_step_ns, self.estimate, frame)
                 # 3. Restart where stamps jumped: earlier frames have another time offset.
                 if restart := self._restart_by_stamps(clock_step_ns, jump):
                     return self._restart(restart, checked.stamp_ns)
@@ -155,7 +160,11 @@ class Tracker:
 
         Returns:
             The last frame's update with the solution; ``converged`` says whether it converged.
+
+        Raises:
+            FactorError: a number of iterations that is none.
         """
+        checked_count("max_iterations", max_iterations)
         at_end = not self.estimate.exists and self._finish_start()
         converged = self.estimate.optimize(max_iterations)
         self.monitor.changes.statistic.softness = self.estimate.softness
@@ -237,7 +246,7 @@ class Tracker:
         if frame.scan is None:
             assert of_image is not None
             return of_image
-        update = self.add_scan(frame.scan)
+        update = self.add_scan(frame.scan, frame.index)
         if of_image is None or of_image.accepted:
             return update
         reason = "; ".join(filter(None, (of_image.reason, update.reason)))

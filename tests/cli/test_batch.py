@@ -202,6 +202,12 @@ def test_on_dask(drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
         (["--set", "nothing=1"], "nothing"),
         (["--init", "nowhere.json"], "nowhere.json"),
         (["--classes", "cow"], "cow"),
+        (["--frames", "x"], "frames 'x'"),
+        (["--frames", "7:3"], "frames 7:3"),
+        (["--loader", "rosbagg"], "rosbagg"),
+        (["--sweep-start-deg", "1e9"], "sweep start"),
+        (["--labels", "nowhere"], "--labels nowhere: found no file or folder"),
+        (["--image-model", "nowhere.onnx"], "--image-model nowhere.onnx: found no file or folder"),
         (["--method", "none"], "--method"),
     ],
 )
@@ -238,6 +244,32 @@ def test_other_options_do_not_mix(drives: Path, tmp_path: Path, capfd: pytest.Ca
     assert "was begun with the options (none), found --set=seed=1" in said
     (out / "batch.json").write_text("{")
     assert main(["batch", bad, "--out", str(out)]) == 2
+
+
+def test_drives_of_no_known_vehicle_are_named(
+    drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("v1_2026-03-01", "v1_2026-03-08", "v2_2026-03-01"):
+        (drives / name / "sequences/00/calib.txt").write_text("P0: 1")
+    command = ["batch", str(drives), "--out", str(tmp_path / "out"), "--vehicle-from", r"(?P<vehicle>v1)_"]
+    assert main(command) == 3
+    said = capfd.readouterr().err
+    assert "note: no vehicle is known of 2 drives: v2_2026-03-01, v2_2026-03-08" in said
+
+
+def test_a_file_of_the_options_is_the_same_to_the_end(
+    drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """An edited --config would give half of the drives other settings."""
+    (tmp_path / "settings.json").write_text('{"seed": 1}')
+    command = ["batch", str(drives / "v2_*-08"), "--out", str(tmp_path / "out"), "--retries", "0"]
+    command += ["--config", str(tmp_path / "settings.json")]
+    assert main(command) == 3 == main(command)
+    (tmp_path / "settings.json").write_text('{"seed": 2}')
+    capfd.readouterr()
+    assert main(command) == 2
+    said = capfd.readouterr().err
+    assert f"was begun with other contents of --config={tmp_path}/settings.json" in said
 
 
 def test_two_batches_do_not_meet(drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

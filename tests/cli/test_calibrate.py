@@ -215,6 +215,19 @@ def test_a_drive_counts_once(street: Path, tmp_path: Path, capsys: pytest.Captur
     assert "given twice" in capsys.readouterr().err
 
 
+def test_each_drive_has_pictures_of_its_own(street: Path, tmp_path: Path) -> None:
+    """Names that differ in a letter of another script, or in a sign only."""
+    drives = [tmp_path / name for name in ("东", "西", "run-1", "run_1")]
+    for drive in drives:
+        shutil.copytree(street, drive)
+    out = tmp_path / "out"
+    options = [*ONE_FRAME, "--set", "search.enabled=false", "--no-report"]
+    assert main(["calibrate", *map(str, drives), "--out", str(out), *options]) == 3
+    listed = re.findall(r"\((overlay_.*?)\)", (out / "report.md").read_text())
+    assert len(listed) == len({*listed}) == len(drives)
+    assert {path.name for path in out.glob("overlay_*")} == {*listed}
+
+
 def test_no_data(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert _calibrate(tmp_path / "nothing", tmp_path / "result") == 2
     assert "nothing: found no file or folder" in capsys.readouterr().err

@@ -139,6 +139,24 @@ def test_a_camchain_without_the_camera(
 _UNIT = "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
 
 
+def test_one_pose_is_no_start_of_two_cameras(
+    refused: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A file that names no camera goes for one; the folder of one camera's result is of that one."""
+    (tmp_path / "start.json").write_text(f'{{"T_camera_lidar": {_UNIT}}}')
+    (tmp_path / "of_one").mkdir()
+    (tmp_path / "of_one/calibration.json").write_text(
+        f'{{"T_camera_lidar": {_UNIT}, "camera": {{"name": "image_2"}}}}'
+    )
+    for init, found in (
+        ("start.json", "found one pose for image_2 and image_3, expected one of each"),
+        ("of_one", "found a calibration of camera image_2, expected one of image_3"),
+    ):
+        options = ["--camera", "image_2", "image_3", "--init", str(tmp_path / init)]
+        assert main(["calibrate", str(refused), *options, "--out", str(tmp_path / "out")]) == 2
+        assert found in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
 def test_a_camera_without_images(refused: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """It is bad input, which is said before anything is calibrated."""
     data = tmp_path / "street"

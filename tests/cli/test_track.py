@@ -127,13 +127,16 @@ def saved(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("options", "message"),
     [
         (["--set", "bogus=1"], "unknown setting 'bogus'"),
-        (["--set", "window=40"], "setting window = 60, expected 40"),
+        (
+            ["--set", "window=40"],
+            "found a tracker with setting window = 60, not 40, expected what it was made with",
+        ),
         (
             ["--classes", "vehicle,pole"],
-            "setting calibration.classes = ['vehicle'], expected ['vehicle', 'pole']",
+            "setting calibration.classes = ['vehicle'], not ['vehicle', 'pole']",
         ),
         (["--init", "none"], "a start from T_camera_lidar"),
-        (["--init", "none"], "expected no guess (--init none)"),
+        (["--init", "none"], ", not from --init none"),
         (["--frames", "1:20"], "another drive (no image of 0 ns in"),
         (["--image-shift", "1"], "another drive (another image of 0 ns in"),
     ],

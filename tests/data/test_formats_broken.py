@@ -112,6 +112,16 @@ BROKEN: list[tuple[str, Change, str]] = [
     ("raw", edit("../calib_velo_to_cam.txt", "R: ", "R: 1 "), "10 values for R"),
     ("raw", edit("../calib_velo_to_cam.txt", "R: ", "R: nan "), "finite numbers for R"),
     ("raw", edit("image_02/timestamps.txt", "2011-09-26", "26.09.2011"), "expected a stamp as 2011-09-26"),
+    (
+        "raw",
+        edit("image_02/timestamps.txt", "2011-09-26", "9999-09-26"),
+        "timestamps.txt:1: found a stamp of",
+    ),
+    (
+        "raw",
+        edit("image_02/timestamps.txt", "2011-09-26", "2117-09-26"),
+        "timestamps.txt:1: found a stamp of",
+    ),
     ("raw", write("image_02/timestamps.txt", "2011-09-26 13:02:25.9\n"), "1 stamp, expected 5 or more"),
     ("raw", write("velodyne_points/timestamps_end.txt", "2011-09-26 13:02:25.9\n"), "1 stamp, expected 5"),
     ("raw", edit("velodyne_points/timestamps.txt", "13:02:25", "14:02:25"), "falling stamps 0 and 1"),

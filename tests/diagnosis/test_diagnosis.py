@@ -146,6 +146,7 @@ def test_frames_without_content_are_no_repeated_ones() -> None:
     blind = drive().with_images(lambda i: replace(i, pixels=NO_PICTURE, mask=np.full_like(i.mask, none)))
     empty = drive().with_scans(lambda s: Scan(s.stamp_ns, s.points[:0], s.classes[:0]))
     assert not any("repeated" in sentence for sentence in (*causes(blind), *causes(empty)))
+    assert causes(blind)[0].startswith("no mask's pixel has a label (vehicle cannot be aligned)")
 
 
 @cache

@@ -10,6 +10,9 @@ from pathlib import Path
 import pytest
 
 from sst_graph.cli import main
+from sst_graph.errors import ConfigError
+from sst_graph.files import MANIFEST
+from sst_graph.fleet import BatchConfig, run_batch
 from sst_graph.fleet.attempt import MOST_KILLS, Job, run_drive
 from sst_graph.fleet.drives import Drive
 from sst_graph.fleet.places import Place
@@ -125,3 +128,36 @@ def test_each_fault_costs_its_drive_alone(kitti_drive: Path, faults: Path, tmp_p
     assert main(["calibrate", str(drives / "fine"), "--out", str(tmp_path / "alone"), "--no-report"]) == 3
     for one in (tmp_path / "alone").iterdir():
         assert one.read_bytes() == (out / "drives/fine" / one.name).read_bytes()
+
+
+def finished(job: Job) -> Record:
+    """A drive that is done, without a calibration: its folder and its record."""
+    job.result.path.mkdir(parents=True)
+    (job.result.path / MANIFEST).write_text("{}")
+    record = Record(job.drive.name, job.place, "ok")
+    job.record.write(record.to_json().encode())
+    return record
+
+
+def refused(job: Job) -> Record:
+    raise AssertionError(f"{job.drive.name} was run again")
+
+
+def test_a_relative_path_means_the_same_data_from_every_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """drives/d1 of another folder is not taken for the one that is done, and the same one is known again."""
+    out, done = Place(str(tmp_path / "out")), {}
+    for week in ("week1", "week2"):
+        (tmp_path / week / "drives/d1").mkdir(parents=True)
+    for folder, drive, run in (
+        ("week1", "drives/d1", finished),
+        ("week1/drives", "d1", refused),
+        (".", "week1/drives/d1", refused),
+    ):
+        monkeypatch.chdir(tmp_path / folder)
+        done = run_batch([Drive("d1", Place(drive))], out, BatchConfig(), lambda progress: None, run)
+    assert done["d1"].place == str(tmp_path / "week1/drives/d1")
+    monkeypatch.chdir(tmp_path / "week2")
+    with pytest.raises(ConfigError, match=r"week2/drives/d1: found a result of .*week1/drives/d1"):
+        run_batch([Drive("d1", Place("drives/d1"))], out, BatchConfig(), lambda progress: None, refused)

@@ -60,6 +60,42 @@ def test_vehicle_and_date_by_a_table(tree: Path, tmp_path: Path) -> None:
     assert (second.vehicle, second.date, second.day) == ("car 7", "", None)
 
 
+def test_a_table_is_of_one_vehicle_a_drive(
+    tree: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However the path is written; a row that is there twice alike says nothing new."""
+    monkeypatch.chdir(tree)
+    drives, table = find_drives("v1"), tmp_path / "vehicles.csv"
+    table.write_text(f"drive,vehicle\n./v1/20260301,a\n{tree}/v1/20260308,a\n{tree}/v1/20260308,a\n")
+    assert [drive.vehicle for drive in with_vehicles(drives, str(table))] == ["a", "a"]
+    table.write_text(f"drive,vehicle\nv1/20260301,a\n{tree}/v1/20260301/,b\n")
+    with pytest.raises(DataError, match=r"two rows of the drive .*v1/20260301/, expected one vehicle"):
+        with_vehicles(drives, str(table))
+
+
+def test_vehicles_of_one_file_name_are_refused_before_anything_is_run(tree: Path, tmp_path: Path) -> None:
+    table = tmp_path / "list.csv"
+    table.write_text("drive,vehicle\na,car 7\nb,car_7\nc,\nd,_\n")
+    with pytest.raises(ConfigError, match=r"vehicles 'car 7' and 'car_7': found one file car_7.json"):
+        find_drives(str(table))
+    table.write_text("drive,vehicle\n20260301,car 7\n20260308,car/7\n")
+    with pytest.raises(ConfigError, match=r"found one file car_7.json"):
+        with_vehicles(find_drives(str(tree / "v1")), str(table))
+    table.write_text("drive,vehicle\na,東京\nb,京都\n")
+    assert [drive.vehicle for drive in find_drives(str(table))] == ["東京", "京都"]
+
+
+def test_a_wrong_date_names_the_drive(tree: Path) -> None:
+    with pytest.raises(DataError, match=r"v1/20260301: found the date .301."):
+        with_vehicles(find_drives(str(tree / "v1")), r"(?P<vehicle>v1)/20260(?P<date>\d+)")
+
+
+def test_a_number_sign_within_a_path_is_no_comment(tmp_path: Path) -> None:
+    (tmp_path / "list.txt").write_bytes(b"\xef\xbb\xbf#1\r\n/data/run#1\r\n/data/run#2\t# rain\r\n")
+    found = find_drives(str(tmp_path / "list.txt"))
+    assert [drive.place.url for drive in found] == ["/data/run#1", "/data/run#2"]
+
+
 @pytest.mark.parametrize(
     "text", ["2026-03-01", "20260301", "2026_03_01", "2026-03-01T00:00:00Z", "20260301_000000"]
 )
@@ -129,6 +165,7 @@ def test_nothing_there(tmp_path: Path, what: str) -> None:
 
 
 def test_names_fit_into_file_names() -> None:
-    assert file_name("a/b c\n(é).mcap") == "a_b_c_.mcap"
+    assert file_name("a/b c\n(é).mcap") == file_name("a/b c\n(e\u0301).mcap") == "a_b_c_é_.mcap"
+    assert file_name("東京 7") == "東京_7" and len(file_name("東" * 999).encode()) == 150
     assert file_name("../../x") == "x" and file_name("..") == "_" and len(file_name("x" * 999)) == 150
     assert Drive("x", Place.of("/a/b/")).place.url == "/a/b"

@@ -148,6 +148,15 @@ def test_all_fine(tmp_path: Path) -> None:
     assert write_summary(drives, records, Place.of(tmp_path), BatchConfig()).all_fine
 
 
+def test_a_summary_leaves_nothing_of_an_earlier_one(tmp_path: Path) -> None:
+    """Vehicles that have another name, or none, when the command is given again."""
+    records = {"x": done("x", result(0))}
+    for vehicle, files in (("old", ["old.json"]), ("new", ["new.json"]), ("", [])):
+        write_summary([drive("x", vehicle)], records, Place.of(tmp_path), BatchConfig())
+        assert sorted(path.name for path in tmp_path.glob("vehicles/*")) == files
+        assert (tmp_path / "vehicles.csv").exists() == bool(vehicle)
+
+
 def test_a_contradicting_drive_stands_before_those_that_are_ok(tmp_path: Path) -> None:
     drives = [drive(f"x{k}", "v") for k in range(6)]
     records = {one.name: done(one.name, result(k, knock=0.03 * (k == 2))) for k, one in enumerate(drives)}

@@ -42,15 +42,21 @@ def _seen_corners(centre: FloatArray, place: FloatArray) -> FloatArray:
 
 
 def _followed(
-    speed_mps: float, ego_mps: float, scans: int = 12, left_m: float = 3.0, start_m: float = 30.0
+    speed_mps: float,
+    ego_mps: float,
+    scans: int = 12,
+    left_m: float = 3.0,
+    start_m: float = 30.0,
+    period_ns: int = PERIOD_NS,
 ) -> ObjectVelocities:
-    """A box that drives along x, seen from a LiDAR that drives along x and looks to the left."""
+    """A box that drives along x, seen from a LiDAR that drives along x and looks to the left; period_ns:
+    between two stamps."""
     velocities = ObjectVelocities()
     for k in range(scans):
         t = 0.1 * k
         wTl = gtsam.Pose3(gtsam.Rot3.Yaw(0.3), np.array([ego_mps * t, 0.0, 0.0]))
         corners = _seen_corners(np.array([start_m + speed_mps * t, left_m]), np.array([ego_mps * t, 0.0]))
-        velocities.add(k, _scan(k * PERIOD_NS, wTl, corners), {NAME: 7}, wTl)
+        velocities.add(k, _scan(k * period_ns, wTl, corners), {NAME: 7}, wTl)
     return velocities
 
 
@@ -100,6 +106,14 @@ def test_objects_without_a_velocity() -> None:
         corners = np.array([[30.0 - 0.9 * k, 3.0], [34.0 - 0.9 * k, 3.0]]) + rng.normal(0.0, 1.0, 2)
         velocities.add(k, _scan(k * PERIOD_NS, gtsam.Pose3(), corners), {NAME: 7}, gtsam.Pose3())
     assert velocities.of(4, NAME) is None
+
+
+@pytest.mark.parametrize("period_ns", [100, 60_000])
+def test_stamps_of_a_clock_that_hardly_runs(period_ns: int) -> None:
+    """Milliseconds divided by a million: scans within a millisecond of each other show no velocity."""
+    velocities = _followed(-9.0, 8.0, period_ns=period_ns)
+    velocities.update_all()
+    assert all(velocities.of(k, NAME) is None for k in range(12))
 
 
 def test_an_end_that_the_field_of_view_cuts_off_is_no_motion() -> None:

@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import gtsam
@@ -22,7 +23,7 @@ from rosbags.highlevel import AnyReader
 
 from sst_graph.cli import main
 from sst_graph.data import KittiSource, open_source
-from sst_graph.errors import ConfigError
+from sst_graph.errors import ConfigError, DataError
 from sst_graph.ros_node import CalibrationNode, NodeSettings, Published
 from sst_graph.tracker.config import TrackerConfig
 
@@ -230,6 +231,35 @@ def test_wrong_first_messages_do_not_keep_it_from_starting(bag: Any, config: Tra
     node.add_mask(dataclasses.replace(mask, header=early), EPOCH_NS)
     assert "bytes" in _diagnostics(node, EPOCH_NS)["calibration"].message
     assert _line(_play(node, messages)[-1])["matches"] > 50
+
+
+def test_the_sensor_whose_messages_cannot_be_used_is_named(bag: Any, config: TrackerConfig) -> None:
+    """Masks of another size are the masks' fault; without a usable cloud it is clouds that are missing."""
+    messages = [one for one in _messages(bag)[:FEW] if one[0] != "/tf_static"]
+    small = Messages().image(EPOCH_NS, np.zeros((4, 4), np.uint8), "mono8")
+    cloud = next(one[3] for one in messages if one[0] == CLOUD)
+    start = dataclasses.replace(SETTINGS, init="none")
+    for topic, content, calibration in (
+        (MASK, small, "starting"),
+        (CLOUD, dataclasses.replace(cloud, data=np.zeros(3, np.uint8)), "no cloud could be used"),
+    ):
+        node = CalibrationNode(start, config)
+        for kind, type_name, now_ns, message in messages:
+            wrong = dataclasses.replace(content, header=message.header) if kind == topic else message
+            _play(node, [(kind, type_name, now_ns, wrong)])
+        found = _diagnostics(node, messages[-1][2])
+        assert found["calibration"].message.startswith(calibration)
+        sensor = found["masks" if topic == MASK else "lidar"]
+        assert sensor.level == 2 and topic in sensor.message
+
+
+def test_a_start_is_of_the_node_s_camera_whatever_its_name(tmp_path: Path) -> None:
+    """A rig's result is named for its topic."""
+    start = {"T_camera_lidar": np.eye(4).tolist(), "time_offset_s": 0.01, "camera": {"name": "/cam1/image"}}
+    (tmp_path / "calibration.json").write_text(json.dumps(start))
+    CalibrationNode(dataclasses.replace(SETTINGS, init=str(tmp_path / "calibration.json")))
+    with pytest.raises(DataError, match=r"nowhere\.json"):
+        CalibrationNode(dataclasses.replace(SETTINGS, init=str(tmp_path / "nowhere.json")))
 
 
 def test_queues_are_bounded(bag: Any, config: TrackerConfig) -> None:

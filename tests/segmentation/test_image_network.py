@@ -159,6 +159,8 @@ def test_equal_networks_and_files_have_equal_identities_and_others_have_others(t
 
 def test_an_onnx_file_is_read_by_the_yaml_file_beside_it(tmp_path: Path) -> None:
     path = write_colour_network(tmp_path / "n.onnx")
+    with pytest.raises(DataError, match=r"nowhere.onnx: found no file or folder"):
+        open_image_segmenter(tmp_path / "nowhere.onnx")
     with pytest.raises(DataError, match=r"n.onnx: found no n.yaml beside it"):
         open_image_segmenter(path)
     assert open_image_segmenter(colour_yaml(path)).known == open_image_segmenter(path).known

@@ -103,6 +103,14 @@ def test_features_spare_the_work_and_change_nothing() -> None:
         np.testing.assert_array_equal(a.lPs, b.lPs)
 
 
+def test_the_mask_may_be_filled_anew_once_features_are_made() -> None:
+    _, image = frame(2)
+    mask = image.mask.copy()
+    features = image_features(2, replace(image, mask=mask), [VEHICLE])
+    mask[:] = SemanticClass.IGNORE
+    np.testing.assert_array_equal(features.mask, image.mask)
+
+
 def test_a_scan_of_another_time_is_the_same_scan_moved() -> None:
     # points carried by hand into the LiDAR frame at the stamp before the image give the same matches
     scan, image = frame(1)

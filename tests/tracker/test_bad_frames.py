@@ -11,9 +11,10 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from streets import saved_tracker
+from streets import EARLY_START, saved_tracker
 
 from sst_graph import CalibrationConfig, PinholeCamera, Tracker
+from sst_graph.batch.config import Method
 from sst_graph.errors import DataError, SstGraphError
 from sst_graph.files.object_store import stored
 from sst_graph.simulator import SimulatedDrive
@@ -267,6 +268,34 @@ def test_wider_dtypes_and_other_orders_are_converted(street: SimulatedDrive, fra
     np.testing.assert_array_equal(checked.classes, scan.classes)
     turned = dataclasses.replace(image, mask=np.asfortranarray(image.mask.astype(np.int16)))
     np.testing.assert_array_equal(checked_image(turned, street.camera).mask, image.mask)
+
+
+@pytest.mark.parametrize(("method", "count"), [("joint", 12), ("edges", 5)])
+def test_arrays_may_be_filled_anew(
+    street: SimulatedDrive, frames: list[Frame], method: Method, count: int, tmp_path: Path
+) -> None:
+    """As a driver does that has one buffer a sensor: estimates and checkpoints are those of arrays apart."""
+    buffers: dict[tuple[type, str], Any] = {}
+
+    def refilled(data: Any) -> Any:
+        changed = {}
+        for name, array in vars(data).items():
+            if isinstance(array, np.ndarray):
+                buffer = buffers.setdefault((type(data), name), np.zeros(2_000_000, array.dtype))
+                changed[name] = buffer[: array.size].reshape(array.shape)
+                changed[name][...] = array
+        return dataclasses.replace(data, **changed)
+
+    config = dataclasses.replace(EARLY_START, calibration=CalibrationConfig(method=method))
+    apart, refilling = (Tracker(street.camera, config, street.nominal) for _ in range(2))
+    for frame in frames[:count]:
+        apart.add(frame)
+        refilling.add(dataclasses.replace(frame, scan=refilled(frame.scan), image=refilled(frame.image)))
+    for buffer in buffers.values():
+        buffer[:] = 0
+    for tracker, name in ((apart, "apart"), (refilling, "refilling")):
+        tracker.save(tmp_path / name)
+    assert (tmp_path / "apart").read_bytes() == (tmp_path / "refilling").read_bytes()
 
 
 def test_one_slip_of_a_clock_is_refused_and_a_clock_that_was_set_is_not(

@@ -13,6 +13,7 @@ from streets import EARLY_START, saved_tracker, sigmas_apart, tracker_from_truth
 from sst_graph import Tracker
 from sst_graph.covariance.cluster_robust import robust_covariance
 from sst_graph.errors import DataError, EstimationError
+from sst_graph.factors import FactorError
 from sst_graph.graph.building import joint_graph, state_from
 from sst_graph.graph.matching import Tracks, associate
 from sst_graph.inspect.gained import gained_of
@@ -72,6 +73,23 @@ def test_the_result_has_the_information_of_each_scan(running: Path) -> None:
     assert first.bits is None and len(rest) > 5
     assert sum(gain.bits or 0.0 for gain in rest) > 3.0
     np.testing.assert_allclose(rest[-1].values, current_update(tracker).sigmas, rtol=1e-3)
+
+
+def test_a_result_names_frames_by_their_numbers_in_the_drive(
+    street: SimulatedDrive, frames: list[Frame]
+) -> None:
+    """Of a drive from its fifth frame on, as the lines of each frame do, and calibrate."""
+    tracker = tracker_from_truth(street)
+    updates = [tracker.add(frame) for frame in frames[5:20]]
+    result = tracker.result("drive")
+    used = {one.frame for one in result.frames_used}
+    assert used <= set(range(5, 20)) and max(used) == updates[-1].frame == 19
+    gained = gained_of(result)
+    assert gained is not None and gained.gains[-1].frame.frame == 19
+    assert set(result.versions) >= {"sst-graph", "gtsam"}
+    for wrong in (lambda: tracker.result(3), lambda: tracker.optimize(1.5), lambda: tracker.optimize(-1)):  # type: ignore[arg-type]
+        with pytest.raises(FactorError, match=r"drive: found 3|max_iterations: found"):
+            wrong()
 
 
 def test_what_leaves_the_window_still_counts(street: SimulatedDrive, frames: list[Frame]) -> None:

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from sst_graph.data.arrays import listed
 from sst_graph.errors import DataError, count_of
 from sst_graph.files.reading import FileKind, read_text
-from sst_graph.timestamps import MAX_STAMPS, check_rising, parse_seconds
-from sst_graph.validation import LATEST_NS
+from sst_graph.timestamps import MAX_STAMPS, check_rising, checked_ns, parse_seconds
 
 STAMPS_CSV = FileKind("a CSV file of name,stamp_ns", 128 * 1024 * 1024)
 LEAST_STEP_NS = 1_000_000
@@ -83,7 +82,7 @@ def _stamp_of(path: Path, table: Path) -> int:
     if _SECONDS.fullmatch(stem):
         return parse_seconds(stem, path)
     if _WHOLE.fullmatch(stem):
-        return _checked(int(stem), path)
+        return checked_ns(int(stem), path)
     expected = f"a stamp (seconds with a decimal point, or whole nanoseconds), or {table.name} beside it"
     raise DataError(path, f"the name {stem!r:.80}", expected)
 
@@ -105,7 +104,7 @@ def _table(table: Path, files: Mapping[str, Path]) -> dict[str, int]:
             raise DataError(f"{table}:{number}", f"{name!r:.80}", f"the name of a file in {table.stem}")
         if name in stamps:
             raise DataError(f"{table}:{number}", f"{name!r:.80} again", "each file once")
-        stamps[name] = _checked(int(words[1]), f"{table}:{number}")
+        stamps[name] = checked_ns(int(words[1]), f"{table}:{number}")
     if not stamps:
         raise DataError(table, "no stamp", "one name,stamp_ns a line")
     return stamps
@@ -117,9 +116,3 @@ def _words(line: str) -> list[str]:
         return [word.strip() for word in next(csv.reader([line], skipinitialspace=True, strict=True), [])]
     except csv.Error:
         return [line]
-
-
-def _checked(stamp_ns: int, place: str | Path) -> int:
-    if abs(stamp_ns) > LATEST_NS:
-        raise DataError(place, f"a stamp of {stamp_ns} ns", f"nanoseconds, at most {LATEST_NS} (146 years)")
-    return stamp_ns

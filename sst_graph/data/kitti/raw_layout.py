@@ -16,7 +16,7 @@ from sst_graph.data.arrays import listed, numbered_files
 from sst_graph.data.kitti.raw_calib import CAM_TO_CAM, VELO_TO_CAM
 from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.files.reading import FileKind, read_text
-from sst_graph.timestamps import MAX_STAMPS, NS_PER_S, check_rising
+from sst_graph.timestamps import MAX_STAMPS, NS_PER_S, check_rising, checked_ns
 
 LAYOUT = (
     "KITTI raw: DATE/DATE_drive_NNNN_sync (or _extract) with velodyne_points and image_0N, and"
@@ -145,7 +145,8 @@ def _stamp(line: str, place: str) -> int:
     except ValueError:
         raise DataError(place, f"{line!r:.60}", "a stamp as 2011-09-26 13:02:25.964389445") from None
     since = moment - _EPOCH
-    return (since.days * 86400 + since.seconds) * NS_PER_S + int((match.group(2) or "0").ljust(9, "0"))
+    seconds = since.days * 86400 + since.seconds
+    return checked_ns(seconds * NS_PER_S + int((match.group(2) or "0").ljust(9, "0")), place)
 
 
 def _sweeps(cloud: Path, count: int) -> SweepTimes | None:

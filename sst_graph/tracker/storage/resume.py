@@ -43,21 +43,21 @@ class Setup:
     initial_time_offset_s: float
 
     def differences(self, other: Setup) -> list[str]:
-        """In what another one differs: "name: found this, expected the other's"."""
+        """In what another one differs: "name, and not the other's"."""
         mine, others = _flat(to_dict(self.config)), _flat(to_dict(other.config))
         found = [
-            f"setting {name} = {mine.get(name)}, expected {others.get(name)}"
+            f"setting {name} = {mine.get(name)}, not {others.get(name)}"
             for name in {**mine, **others}
             if mine.get(name) != others.get(name)
         ]
         if self.camera != other.camera:
-            found.append(f"a camera {self.camera}, expected {other.camera}")
+            found.append(f"a camera {self.camera}, not {other.camera}")
         if (
             not _same(self.initial, other.initial)
             or self.initial_time_offset_s != other.initial_time_offset_s
         ):
             mine_text, other_text = (_start_text(setup) for setup in (self, other))
-            found.append(f"a start from {mine_text}, expected {other_text}")
+            found.append(f"a start from {mine_text}, not from {other_text}")
         return found
 
 
@@ -100,7 +100,7 @@ def check_setup(tracker: Tracker, setup: Setup, place: str | Path) -> None:
     """
     if found := tracker.setup.differences(setup):
         some = "; ".join(found[:5]) + (f"; and {len(found) - 5} more" if len(found) > 5 else "")
-        raise DataError(place, some, "what the tracker was made with (or a new tracker)")
+        raise DataError(place, f"a tracker with {some}", "what it was made with (or a new tracker)")
 
 
 def frames_to_come(tracker: Tracker, source: Source, place: str | Path) -> Iterator[Frame]:
@@ -197,7 +197,7 @@ def _same(a: gtsam.Pose3 | None, b: gtsam.Pose3 | None) -> bool:
 
 def _start_text(setup: Setup) -> str:
     if setup.initial is None:
-        return "no guess (--init none)"
+        return "--init none"
     translation = ", ".join(f"{x:.4g}" for x in setup.initial.translation())
     turn = ", ".join(f"{x:.4g}" for x in gtsam.Rot3.Logmap(setup.initial.rotation()))
     return f"T_camera_lidar [{turn}] rad, [{translation}] m with {setup.initial_time_offset_s:.4g} s (--init)"

@@ -20,7 +20,7 @@ class InformationLog:
     """Covariance after each scan that was used.
 
     Attributes:
-        rows: (9,) each: number of the scan, bits gained (NaN for the first after a start), sigmas after it.
+        rows: (9,) each: number of the frame, bits gained (NaN for the first after a start), sigmas after it.
     """
 
     def __init__(self) -> None:
@@ -31,10 +31,10 @@ class InformationLog:
         """A new calibration begins; the information of its first scan is not known."""
         self._last = None
 
-    def add(self, scan: int, covariance: FloatArray) -> None:
-        """A scan was used; the covariance after it (7, 7)."""
+    def add(self, frame: int, covariance: FloatArray) -> None:
+        """The scan of a frame was used; the covariance after it (7, 7)."""
         bits = np.nan if self._last is None else bits_between(self._last, covariance)
-        self.rows.append(np.array([scan, bits, *np.sqrt(np.diag(covariance))]))
+        self.rows.append(np.array([frame, bits, *np.sqrt(np.diag(covariance))]))
         self._last = covariance.copy()
 
     def gained(self, drive: str) -> Gained:

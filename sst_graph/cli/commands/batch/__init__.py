@@ -14,7 +14,8 @@ from sst_graph.cli.commands.batch.progress import ProgressOnStderr
 from sst_graph.cli.inputs import calibration_settings
 from sst_graph.cli.messages import complain, mention
 from sst_graph.cli.options import SOURCE_DEFAULTS
-from sst_graph.errors import ConfigError
+from sst_graph.cli.reading import check_options
+from sst_graph.errors import ConfigError, count_of
 from sst_graph.fleet import (
     BatchConfig,
     Drive,
@@ -41,6 +42,7 @@ def run(args: argparse.Namespace) -> int:
     drives = find_drives(args.drives, _at_least("--name-parts", args.name_parts, 1))
     if args.vehicle_from is not None:
         drives = with_vehicles(drives, args.vehicle_from)
+        _say_without_vehicle(drives)
     out = Place.of(args.out)
     out = Place(os.path.abspath(out.url)) if out.is_local else out
     _check_apart(drives, out)
@@ -105,6 +107,7 @@ def _passed_on(args: argparse.Namespace) -> tuple[str, ...]:
 def _check_passed_on(args: argparse.Namespace) -> None:
     """Refuse at once what every drive would refuse."""
     calibration_settings(args)
+    check_options(args)
     if args.init not in ("dataset", "none"):
         load_initial(Path(args.init), args.camera or str(SOURCE_DEFAULTS["camera"]))
 
@@ -122,6 +125,13 @@ def _check_apart(drives: list[Drive], out: Place) -> None:
             raise ConfigError(
                 f"--out {out}: found the drive {drive.place} in it or around it, expected two places"
             )
+
+
+def _say_without_vehicle(drives: list[Drive]) -> None:
+    without = [drive.name for drive in drives if not drive.vehicle]
+    if without:
+        some = ", ".join(without[:_MOST_SAID]) + (", ..." if len(without) > _MOST_SAID else "")
+        complain(f"note: no vehicle is known of {count_of(len(without), 'drive')}: {some}")
 
 
 def _say(outcome: Outcome, out: Place) -> None:
