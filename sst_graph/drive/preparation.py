@@ -26,9 +26,8 @@ from sst_graph.files.array_store import IN_MEMORY_BYTES, ArrayStore, storable
 from sst_graph.files.object_store import PackedArray
 from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
-from sst_graph.odometry.relative import relative_pose
 from sst_graph.odometry.sweep import SweepDecision, SweptSource
-from sst_graph.odometry.visual import ImagePair
+from sst_graph.odometry.visual import ImagePair, next_pair
 from sst_graph.types import CameraImage, Frame, RelativeMotion, Scan, SemanticClass, Source
 from sst_graph.validation import checked_frame, checked_image, checked_scan
 
@@ -354,10 +353,10 @@ def prepare_drive(
             features = scan_features(frame.index, frame.scan, classes, config, depth, with_lower_edges)
             scans.append(features.stored_in(store))
         if frame.image is not None:
-            if config.use_visual_odometry and tracker.seconds_to(frame.image) >= config.track_interval_s:
-                tracks = tracker.add(frame.image)
-                if tracks is not None:
-                    pairs.append(ImagePair(tracks, relative_pose(tracks, source.camera)))
+            if config.use_visual_odometry:
+                pair = next_pair(tracker, frame.image, source.camera, config.track_interval_s)
+                if pair is not None:
+                    pairs.append(pair)
             contours = image_features(frame.index, frame.image, classes, config.image_edges)
             images.append(contours.stored_in(store))
         if progress is not None:
