@@ -202,11 +202,11 @@ def _angle_within(largest: float, rng: np.random.Generator) -> float:
             return angle
 
 
-def binomial_bounds(count: int, of: int, confidence: float = _CONFIDENCE) -> tuple[float, float]:
+def binomial_bounds(count: int, of: int) -> tuple[float, float]:
     """Exact bounds of a probability that showed ``count`` times in ``of`` (Clopper and Pearson, 1934)."""
     from scipy.stats import beta
 
-    tail = 0.5 * (1.0 - confidence)
+    tail = 0.5 * (1.0 - _CONFIDENCE)
     low = 0.0 if count == 0 else float(beta.ppf(tail, count, of - count + 1))
     high = 1.0 if count == of else float(beta.ppf(1.0 - tail, count + 1, of - count))
     return low, high

@@ -30,6 +30,8 @@ MIN_NOISE_PX = 0.05
 _MIN_PARALLAX_RATIO = 4.0
 """The direction counts only where the parallax is this many times the noise; below, the five-point method's
 direction is noise."""
+_KNEE = 1.345
+"""Whitened residual beyond which Huber's weights fall."""
 _ITERATIONS = 8
 """Most Gauss-Newton steps of the refinement; it stops where a step is below 1e-5."""
 
@@ -106,7 +108,7 @@ def rays(uvs: FloatArray, camera: PinholeCamera) -> FloatArray:
     )
 
 
-def huber_weights(size: FloatArray, knee: float = 1.345, gate: float = 4.0) -> FloatArray:
+def huber_weights(size: FloatArray, knee: float = _KNEE, gate: float = 4.0) -> FloatArray:
     """Weight of whitened residuals of given size; 0 beyond the gate, where nothing is noise."""
     size = np.abs(size)
     weights = np.minimum(1.0, knee / np.maximum(size, 1e-12))
@@ -271,10 +273,10 @@ def _inverse_of_genuine(information: FloatArray, spurious: FloatArray) -> FloatA
     return np.asarray((root / np.maximum(values, 0.02)) @ root.T)
 
 
-def _cost_of_weights(whitened: FloatArray, knee: float = 1.345) -> float:
+def _cost_of_weights(whitened: FloatArray) -> float:
     """E[psi^2] / E[psi']^2: what the robust weights cost in variance (Huber 1981, eq. 7.6.7)."""
-    psi = np.clip(whitened, -knee, knee)
-    inside = float(np.mean(np.abs(whitened) < knee))
+    psi = np.clip(whitened, -_KNEE, _KNEE)
+    inside = float(np.mean(np.abs(whitened) < _KNEE))
     return float(np.mean(psi**2)) / max(inside, 0.1) ** 2
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -29,8 +28,6 @@ from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.track_update import TrackUpdate
 from sst_graph.tracker.tracker import Tracker
 from sst_graph.types import CameraImage, Frame, SemanticClass
-
-_LOG = logging.getLogger(__name__)
 
 
 class CalibrationNode:

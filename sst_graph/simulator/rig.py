@@ -33,20 +33,18 @@ class Mount:
     time_offset_s: float
 
 
-def beside(drive: SimulatedDrive, cTa: gtsam.Pose3, time_offset_s: float | None = None) -> Mount:
-    """A camera that stands to the drive's own exactly as the data say.
+def beside(drive: SimulatedDrive, cTa: gtsam.Pose3) -> Mount:
+    """A camera that stands to the drive's own exactly as the data say, with the same trigger.
 
     Args:
         cTa: pose of the drive's own camera in the further one.
-        time_offset_s: of its images; by default the same, as of cameras with one trigger [s].
     """
-    time_offset_s = drive.config.time_offset_s if time_offset_s is None else time_offset_s
-    return Mount(cTa * drive.nominal, cTa * drive.truth.cTl, time_offset_s)
+    return Mount(cTa * drive.nominal, cTa * drive.truth.cTl, drive.config.time_offset_s)
 
 
-def stereo_pose(baseline_m: float = STEREO_BASELINE_M) -> gtsam.Pose3:
+def stereo_pose() -> gtsam.Pose3:
     """Pose of the left camera in the right one."""
-    return gtsam.Pose3(gtsam.Rot3(), np.array([-baseline_m, 0.0, 0.0]))
+    return gtsam.Pose3(gtsam.Rot3(), np.array([-STEREO_BASELINE_M, 0.0, 0.0]))
 
 
 def surround(drive: SimulatedDrive, count: int = 6) -> dict[str, Mount]:
