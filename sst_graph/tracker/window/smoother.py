@@ -16,7 +16,7 @@ from sst_graph.association.edge_matching import SIDES
 from sst_graph.assumptions import ASSUMPTIONS, named_sigmas
 from sst_graph.covariance.error_model import ErrorModel
 from sst_graph.covariance.jackknife import composed
-from sst_graph.errors import EstimationError
+from sst_graph.errors import EstimationError, one_line
 from sst_graph.factors import extrinsic_drift, time_offset_drift
 from sst_graph.graph.building import motion_factor, silhouettes_factor
 from sst_graph.graph.matching import GraphConfig
@@ -163,7 +163,7 @@ class WindowSmoother:
         try:
             update.run()
         except (RuntimeError, ValueError, np.linalg.LinAlgError) as error:
-            raise EstimationError(f"the update failed: {' '.join(str(error).split())[:200]}") from error
+            raise EstimationError(f"the update failed: {one_line(error):.200}") from error
         self._keep(update)
 
     def _keep(self, update: SmootherUpdate) -> None:
