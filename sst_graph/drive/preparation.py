@@ -19,7 +19,7 @@ from sst_graph.drive.trajectory import GrowingTrack, TwistTrack
 from sst_graph.errors import DataError, count_of
 from sst_graph.factors.arguments import checked_callback
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.features.lidar_edges import MAX_RANGE_M, Boundaries, Edge, find_boundaries
+from sst_graph.features.lidar_edges import MAX_RANGE_M, Boundaries, Edge, find_boundaries, with_points
 from sst_graph.features.mask_contour import ContourMap
 from sst_graph.features.picture_gradients import PictureGradients
 from sst_graph.files.array_store import IN_MEMORY_BYTES, ArrayStore, storable
@@ -442,10 +442,7 @@ def apart(
         boundaries[c] = points.take(np.flatnonzero(~down))
         known = np.isin(points.objects, boundaries[c].objects)
         lower_edges[c] = points.take(np.flatnonzero(down & known))
-    return (
-        {c: points for c, points in boundaries.items() if len(points)},
-        {c: points for c, points in lower_edges.items() if len(points)},
-    )
+    return with_points(boundaries), with_points(lower_edges)
 
 
 def boundaries_of(

@@ -9,13 +9,12 @@ import gtsam
 import numpy as np
 
 from sst_graph.errors import ConfigError
+from sst_graph.metrics import FORWARD_R_OPTICAL
 from sst_graph.simulator.drive import SimulatedDrive, mounting_error
 from sst_graph.types import GroundTruth
 
 STEREO_BASELINE_M = 0.5329697
 """KITTI's image_3 stands so far to the right of image_2 [m]."""
-_OPTICAL = gtsam.Rot3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
-"""Rotation of a camera that looks forward (x right, y down, z forward) in the LiDAR (x forward, z up)."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,7 @@ def surround(drive: SimulatedDrive, count: int = 6) -> dict[str, Mount]:
         yaw = 2.0 * np.pi * k / count
         arm = float(rng.uniform(0.2, 1.0))
         where = np.array([arm * np.cos(yaw), arm * np.sin(yaw), -float(rng.uniform(0.0, 0.3))])
-        nominal = gtsam.Pose3(gtsam.Rot3.Rz(yaw) * _OPTICAL, where).inverse()
+        nominal = gtsam.Pose3(gtsam.Rot3.Rz(yaw) * FORWARD_R_OPTICAL, where).inverse()
         time_offset_s = drive.config.time_offset_s + float(rng.uniform(-0.03, 0.03))
         mounts[f"camera_{k}"] = Mount(nominal, nominal * mounting_error(drive.config, rng), time_offset_s)
     return mounts

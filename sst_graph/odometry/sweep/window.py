@@ -21,7 +21,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from sst_graph.odometry.cloud import compensate_sweep, usable_points
-from sst_graph.odometry.lidar import MOVABLE_CLASSES, LidarOdometry
+from sst_graph.odometry.lidar import MOVABLE_CLASSES, LidarOdometry, orthonormal
 from sst_graph.odometry.static_points import on_static_objects
 from sst_graph.sweep_timing import turned
 from sst_graph.types import Scan
@@ -236,7 +236,7 @@ class Window:
         """Move the poses by the step that goes with a step (1 + SECTORS,) of the times."""
         steps = (normal.back[0] @ u + normal.back[1]).reshape(-1, 6)
         self._poses = [
-            np.asarray((gtsam.Pose3(_orthonormal(pose)) * gtsam.Pose3.Expmap(step)).matrix())
+            np.asarray((gtsam.Pose3(orthonormal(pose)) * gtsam.Pose3.Expmap(step)).matrix())
             for pose, step in zip(self._poses, steps, strict=True)
         ]
 
@@ -436,7 +436,3 @@ def _odometry(scans: Sequence[Scan]) -> tuple[bool, list[FloatArray]]:
         ok &= motion is not None and motion.ok
         poses.append(np.asarray(odometry.pose.matrix()))
     return ok, poses
-
-
-def _orthonormal(matrix: FloatArray) -> FloatArray:
-    return np.asarray(gtsam.Pose3(gtsam.Rot3.ClosestTo(matrix[:3, :3]), matrix[:3, 3]).matrix())
