@@ -228,6 +228,13 @@ def telling_frames(frames: Sequence[FrameInformation], unknown: int) -> list[int
     return [int(k) for k in order[:3] if frames[int(k)].without[unknown] > 1.0]
 
 
+def sigma_ellipse(covariance: FloatArray, count: int) -> FloatArray:
+    """(2, count) closed line of one sigma around the origin, of a covariance (2, 2)."""
+    circle = np.stack([np.cos(t := np.linspace(0.0, 2.0 * np.pi, count)), np.sin(t)])
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * circle))
+
+
 def to_dict(inspection: Inspection) -> dict[str, Any]:
     """The inspection as a JSON-able dictionary; units in the names, SI but for sigmas in ``sigmas``."""
     result = inspection.result

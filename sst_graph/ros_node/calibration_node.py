@@ -224,7 +224,7 @@ class CalibrationNode:
         if not self.lidar.frame:
             return None, 0.0, "no cloud yet"
         oTl, why = self._transforms.pose(self.camera.frame, self.lidar.frame)
-        return (None if oTl is None else gtsam.Pose3(geometry.cRo, np.zeros(3)) * oTl), 0.0, why
+        return (None if oTl is None else geometry.extrinsic(oTl)), 0.0, why
 
     def _use(self, one: Waiting, now_ns: int) -> TrackUpdate | None:
         """Decode a message and give it to the tracker; its update, or None where it cannot be decoded."""
