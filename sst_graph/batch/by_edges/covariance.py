@@ -75,7 +75,7 @@ class EdgesCovariance:
             :func:`~sst_graph.batch.assumption_tests.assumption_report`.
         estimated: value and deviation of the parameters that are unknowns of the estimate, by name,
             JSON-able.
-        reasons: to doubt it.
+        reasons: why it may be too small.
         shared: what of it the other cameras on this LiDAR have, too.
     """
 
@@ -148,8 +148,8 @@ def few_edges(steps: FloatArray, outlines: FloatArray | None) -> tuple[str, ...]
         steps: of the half-samples.
         outlines: step without upper edges that may be no outline, or None.
     """
-    doubts = {FEW_OBJECTS: with_estimate(steps).sum() < FEWEST, FEW_OUTLINES: outlines is None}
-    return tuple(reason for reason, holds in doubts.items() if holds)
+    holding = {FEW_OBJECTS: with_estimate(steps).sum() < FEWEST, FEW_OUTLINES: outlines is None}
+    return tuple(reason for reason, holds in holding.items() if holds)
 
 
 def half_samples() -> BoolArray:
