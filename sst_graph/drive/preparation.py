@@ -15,7 +15,7 @@ from sst_graph.config import Settings, internal
 from sst_graph.data.frame_parts import NumberedFrames
 from sst_graph.drive.geometric_labels import labelled_by_geometry
 from sst_graph.drive.input_statistics import InputStatistics, StatisticsCollector
-from sst_graph.drive.trajectory import GrowingTrack, TwistTrack
+from sst_graph.drive.twists import GrowingTwists, SensorTwists
 from sst_graph.errors import DataError, count_of
 from sst_graph.factors.arguments import checked_callback
 from sst_graph.factors.camera import PinholeCamera
@@ -307,13 +307,13 @@ class Drive:
         stamps = self.scan_stamps_ns
         return float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else 0.1
 
-    def lidar_track(self, growing: GrowingTrack | None = None) -> TwistTrack | None:
+    def lidar_twists(self, growing: GrowingTwists | None = None) -> SensorTwists | None:
         """Twists of the LiDAR over time, smoothed, exactly zero at standstill; None for a single scan.
 
         Args:
             growing: cache that holds the motions of earlier calls.
         """
-        return (growing or GrowingTrack()).of(self.lidar_motions)
+        return (growing or GrowingTwists()).of(self.lidar_motions)
 
 
 def prepare_drive(

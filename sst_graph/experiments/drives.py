@@ -13,7 +13,7 @@ from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drive
 from sst_graph.config import Settings, setting
 from sst_graph.data import open_source
 from sst_graph.drive.preparation import Drive, Progress
-from sst_graph.drive.trajectory import camera_twist
+from sst_graph.drive.twists import camera_twist
 from sst_graph.errors import ConfigError
 from sst_graph.experiments.starts import start_near
 from sst_graph.graph.matching import Tracks

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.assumptions import ASSUMPTIONS, named_sigmas
-from sst_graph.drive.trajectory import camera_twist
+from sst_graph.drive.twists import camera_twist
 from sst_graph.factors import (
     GroupedBias,
     LidarTwist,

@@ -12,7 +12,7 @@ from sst_graph.association.edge_matching import GATE
 from sst_graph.association.time_pairing import pair_by_time
 from sst_graph.batch.lower_edges import LowerEdgeSupport, lower_edge_support
 from sst_graph.drive.preparation import Drive, boundaries_of, boundary_count
-from sst_graph.drive.trajectory import GrowingTrack
+from sst_graph.drive.twists import GrowingTwists
 from sst_graph.factors import alignment_cost
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.matching import (
@@ -49,7 +49,7 @@ class WindowMatcher:
         self.held_names = held_names(self.graph.estimate, self.classes)
         self.kernel = RobustKernel("geman_mcclure", KERNELS_PX[-1])
         self._twists: tuple[int, Tracks] | None = None
-        self._growing = GrowingTrack(_SMOOTHED)
+        self._growing = GrowingTwists(_SMOOTHED)
         self._last: tuple[Point, dict[int, PairMatches]] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
