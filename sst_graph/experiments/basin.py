@@ -19,6 +19,7 @@ from sst_graph.data import open_source
 from sst_graph.drive.preparation import Progress
 from sst_graph.errors import ConfigError, count_of
 from sst_graph.experiments.resumable import Work, rows_of
+from sst_graph.experiments.starts import truth_of
 from sst_graph.metrics import calibration_errors
 from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.types import Source
@@ -143,9 +144,7 @@ def runs_of(task: Task) -> list[BasinRun]:
     """
     config = task.config
     source = _source(task)
-    truth = source.truth
-    if truth is None:
-        raise ConfigError(f"{source.name}: found no reference calibration, expected one")
+    truth = truth_of(source)
     drives = prepare_drives([source], config.calibration)
     found = []
     for search_deg, search_m, starts in zip(
