@@ -37,7 +37,7 @@ def with_camera(
     source: Source,
     classes: Sequence[SemanticClass],
     config: PrepareConfig,
-    progress: Progress | None = None,
+    progress: Progress | None,
 ) -> Drive:
     """The drive with the images of another camera; its scans, motions and sweep are shared.
 

@@ -307,7 +307,7 @@ class Drive:
         stamps = self.scan_stamps_ns
         return float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else 0.1
 
-    def lidar_twists(self, growing: GrowingTwists | None = None) -> SensorTwists | None:
+    def lidar_twists(self, growing: GrowingTwists | None) -> SensorTwists | None:
         """Twists of the LiDAR over time, smoothed, exactly zero at standstill; None for a single scan.
 
         Args:

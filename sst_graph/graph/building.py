@@ -86,7 +86,7 @@ def silhouettes_factor(
     D: int,
     V: int,
     bias_of: Callable[[SemanticClass], int],
-    nuisances: Mapping[str, float] | None = None,
+    nuisances: Mapping[str, float] | None,
 ) -> gtsam.CustomFactor:
     """All silhouette matches of one pair as one condensed factor on extrinsic, offset, twist and mask biases.
 

@@ -192,7 +192,7 @@ def cylinder_triangles(
     return loft_triangles(np.stack([start + radii[0] * circle, end + radii[1] * circle]))
 
 
-def blob_triangles(rng: np.random.Generator, radii: FloatArray, rough: float, rows: int = 7) -> FloatArray:
+def blob_triangles(rng: np.random.Generator, radii: FloatArray, rough: float, rows: int) -> FloatArray:
     """Triangles of a rough ellipsoid about the origin: radii (3,) [m], ``rough`` the relative bumps."""
     columns = 2 * rows - 3
     polar = np.pi * np.arange(rows) / (rows - 1)

@@ -46,7 +46,7 @@ def stereo_pose() -> gtsam.Pose3:
     return gtsam.Pose3(gtsam.Rot3(), np.array([-STEREO_BASELINE_M, 0.0, 0.0]))
 
 
-def surround(drive: SimulatedDrive, count: int = 6) -> dict[str, Mount]:
+def surround(drive: SimulatedDrive, count: int) -> dict[str, Mount]:
     """Cameras all around: at even steps of yaw from that of the drive's own, each nominal pose wrong by the
     configured error in its own way, with lever arms of 0.2 to 1 m and time offsets within 30 ms of the
     drive's."""

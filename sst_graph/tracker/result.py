@@ -9,7 +9,7 @@ import numpy as np
 from sst_graph.batch.assumption_tests import assumption_report
 from sst_graph.config import to_dict
 from sst_graph.inspect.gained import KEY, to_document
-from sst_graph.result import UNNAMED_CAMERA, CalibrationResult, FrameId, Status
+from sst_graph.result import CalibrationResult, FrameId, Status
 from sst_graph.tracker.make_update import current_update
 from sst_graph.tracker.track_update import TrackUpdate
 
@@ -18,9 +18,7 @@ if TYPE_CHECKING:
     from sst_graph.tracker.tracker import Tracker
 
 
-def tracker_result(
-    tracker: Tracker, drive: str = "stream", camera_name: str = UNNAMED_CAMERA
-) -> CalibrationResult:
+def tracker_result(tracker: Tracker, drive: str, camera_name: str) -> CalibrationResult:
     """The present estimate as a result; frames used are those of the window."""
     last, estimate, window = current_update(tracker), tracker.estimate, tracker.inputs.window
     status: Status = "ok" if last.status == "ok" else "not_converged"

@@ -234,7 +234,7 @@ class Bag:
             raise _unreadable(self.path, error) from error
 
 
-def message_types(is_ros1: bool = False) -> Any:
+def message_types(is_ros1: bool) -> Any:
     """Definitions of the messages, a typestore of rosbags."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 

@@ -102,7 +102,7 @@ class WindowMatcher:
         return found, set(numbers) - set(found)
 
     def linearized_at(
-        self, point: Point, chosen: Collection[int], kernel: RobustKernel, without: Collection[int] = ()
+        self, point: Point, chosen: Collection[int], kernel: RobustKernel, without: Collection[int]
     ) -> list[LinearizedPair]:
         """Some scans matched and linearized at a point, without the objects of some tracks."""
         return self.linearized(self.pairs_at(point, chosen, kernel), point, without)
@@ -112,7 +112,7 @@ class WindowMatcher:
         return self._pairs(point, chosen, kernel)[0]
 
     def linearized(
-        self, pairs: Mapping[int, PairMatches], point: Point, without: Collection[int] = ()
+        self, pairs: Mapping[int, PairMatches], point: Point, without: Collection[int]
     ) -> list[LinearizedPair]:
         """Matches of scans, made at a point, linearized there without the objects of some tracks."""
         if without:
