@@ -96,7 +96,7 @@ def _as_mask(mask: NDArray[Any], place: str | Path) -> NDArray[np.uint8]:
     return mask
 
 
-def read_instances(path: Path, size: Size | None) -> NDArray[np.uint16]:
+def read_instances(path: Path, size: Size | None = None) -> NDArray[np.uint16]:
     """Instances (h, w) uint16 of a PNG file with class * 256 + instance; 0: none.
 
     Args:
