@@ -68,7 +68,7 @@ def condense_gram(G: FloatArray, constant: float) -> tuple[FloatArray, FloatArra
     return condense_root(square_root(G), constant)
 
 
-def condense_root(R: FloatArray, constant: float = 0.0) -> tuple[FloatArray, FloatArray]:
+def condense_root(R: FloatArray, constant: float) -> tuple[FloatArray, FloatArray]:
     """As :func:`condense_gram`, from a root R (k, cols + 1), R^T R = G, of no more than cols + 1 rows."""
     k, m = R.shape
     J, error = np.zeros((m + 1, m - 1)), np.zeros(m + 1)

@@ -14,6 +14,8 @@ __all__ = [
     "MissingDependencyError",
     "SstGraphError",
     "count_of",
+    "first_line",
+    "one_line",
     "printable",
 ]
 
@@ -55,3 +57,13 @@ class ContradictionError(EstimationError):
 
 class MissingDependencyError(SstGraphError):
     """An optional dependency is not installed; the message names the extra to install."""
+
+
+def one_line(error: BaseException) -> str:
+    """What an exception says, on one line; the name of its class where it says nothing."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def first_line(error: BaseException) -> str:
+    """The first line of what an exception says; the name of its class where it says nothing."""
+    return (str(error).splitlines() or [type(error).__name__])[0]

@@ -70,6 +70,11 @@ class WeakDirection(ByValue):
     sentence: str
     advice: str
 
+    @property
+    def reason(self) -> str:
+        """Sentence and advice."""
+        return f"{self.sentence}: {self.advice}"
+
 
 @dataclass(frozen=True)
 class FrameId:

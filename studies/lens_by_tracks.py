@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph import open_source
-from sst_graph.assumptions import ASSUMPTIONS, View
+from sst_graph.assumptions import ASSUMPTIONS
+from sst_graph.assumptions.model import Scene
 from sst_graph.data.frame_parts import image_at, image_positions
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.odometry.features import Tracks
@@ -49,7 +50,7 @@ def tracked(source: Source) -> list[ImagePair]:
 def pixel_shift(name: str, uvs: FloatArray, camera: PinholeCamera) -> FloatArray:
     """(n, 2) what one unit of a lens parameter does to pixels."""
     n = len(uvs)
-    view = View(np.ones((n, 3)), np.zeros(n), uvs, camera, np.zeros(6), 0.0, 0.1)
+    view = Scene(camera, np.zeros(6), 0.0, 0.1).view(np.ones((n, 3)), np.zeros(n), uvs)
     shift = ASSUMPTIONS[name].effect(view).pixel_shift
     assert shift is not None
     return shift

@@ -65,5 +65,5 @@ def _image_pair(a: int, b: int, wTl: PoseAt, rng: np.random.Generator, noise: fl
         gtsam.Unit3(direction).retract(noise * SIGMA_DIRECTION * rng.standard_normal(2)).point3()
     )
     covariance = np.diag([SIGMA_RAD**2] * 3 + [SIGMA_DIRECTION**2] * 2)
-    motion = DirectionMotion(turn, turn, seen, covariance, np.ones(0, bool), 0.1, length > 0.1)
+    motion = DirectionMotion(turn, turn, seen, covariance, 0.1, length > 0.1)
     return ImagePair(ImageTracks(a, b, np.zeros((0, 2)), np.zeros((0, 2))), motion)

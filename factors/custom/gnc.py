@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..arguments import checked_number, checked_positive, checked_type, described, is_whole
 from ..errors import FactorError
 from .cloning import checked_graph, own_recipe
-from .variables import checked_values
+from .variables import checked_values, factors_of
 
 FloatArray = NDArray[np.float64]
 
@@ -92,7 +92,7 @@ def gnc(
         FactorError: a factor that cannot be weighted, no value for one of its keys, or no graph.
     """
     checked_graph("graph of gnc", graph)
-    checked_values("values of gnc", values, [graph.at(i) for i in range(graph.size()) if graph.exists(i)])
+    checked_values("values of gnc", values, factors_of(graph))
     checked_type("config of gnc", config, GncParams, "a sst_graph.factors.GncParams")
     expected = "positions of factors, as a list or a set"
     checked_type("known_inliers of gnc", known_inliers, (list, tuple, set, frozenset, range), expected)

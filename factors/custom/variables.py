@@ -154,11 +154,15 @@ def expect_kinds(what: str, values: gtsam.Values, factors: Iterable[gtsam.Nonlin
             raise FactorError(what, found, "the size that the factor has") from None
 
 
+def factors_of(graph: gtsam.NonlinearFactorGraph) -> list[gtsam.NonlinearFactor]:
+    """The factors of a graph, without its empty places."""
+    return [graph.at(i) for i in range(graph.size()) if graph.exists(i)]
+
+
 def checked_problem(where: str, graph: Any, values: Any, further: Iterable[int] = ()) -> None:
     """Nothing, where they are a graph and values of all its keys, and of the further keys."""
     checked_type(f"graph of {where}", graph, gtsam.NonlinearFactorGraph, "a NonlinearFactorGraph")
-    factors = [graph.at(i) for i in range(graph.size()) if graph.exists(i)]
-    checked_values(f"values of {where}", values, factors, further)
+    checked_values(f"values of {where}", values, factors_of(graph), further)
 
 
 def checked_keys(factor: str, keys: Sequence[Any] | Mapping[str, Any]) -> dict[int, str]:

@@ -24,13 +24,10 @@ FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class View:
-    """Points of one scan as one image sees them, or of several of one drive.
+class Scene:
+    """All that the effects of assumptions depend on but the points: of one scan and one image, or of several.
 
     Attributes:
-        lPs: (n, 3) points in the LiDAR frame [m].
-        offsets_s: (n,) time of each point relative to its scan's stamp [s].
-        uvs: (n, 2) their pixels by the ideal camera; NaN behind it [px].
         camera: the ideal camera.
         l_twist: (6,) the LiDAR's twist at the image's instant [rad/s, m/s], or (k, 6) of several images or
             of each point; zeros where it is not known.
@@ -38,20 +35,39 @@ class View:
         period_s: time between two scans [s].
     """
 
-    lPs: FloatArray
-    offsets_s: FloatArray
-    uvs: FloatArray
     camera: PinholeCamera
     l_twist: FloatArray
     image_s: float | FloatArray
     period_s: float
 
     @property
+    def centre(self) -> FloatArray:
+        """(2,) the principal point [px]."""
+        return np.array([self.camera.cx, self.camera.cy])
+
+    def view(self, lPs: FloatArray, offsets_s: FloatArray, uvs: FloatArray) -> View:
+        """Points of the scan as the image sees them; arguments as in :class:`View`."""
+        return View(self.camera, self.l_twist, self.image_s, self.period_s, lPs, offsets_s, uvs)
+
+
+@dataclass(frozen=True)
+class View(Scene):
+    """Points of one scan as one image sees them, or of several of one drive.
+
+    Attributes:
+        lPs: (n, 3) points in the LiDAR frame [m].
+        offsets_s: (n,) time of each point relative to its scan's stamp [s].
+        uvs: (n, 2) their pixels by the ideal camera; NaN behind it [px].
+    """
+
+    lPs: FloatArray
+    offsets_s: FloatArray
+    uvs: FloatArray
+
+    @property
     def rays(self) -> FloatArray:
         """(n, 2) x = X/Z and y = Y/Z of the points in the ideal camera."""
-        camera = self.camera
-        centre, focal = np.array([camera.cx, camera.cy]), np.array([camera.fx, camera.fy])
-        return np.asarray((self.uvs - centre) / focal)
+        return np.asarray((self.uvs - self.centre) / np.array([self.camera.fx, self.camera.fy]))
 
 
 @dataclass(frozen=True)
@@ -110,29 +126,6 @@ class Assumption:
         """The parameter's estimate with deviation and unit, as text."""
         unit = f" {self.unit}" if self.unit else ""
         return f"{self.name} = {value:.3g} ± {sigma:.2g}{unit}"
-
-
-@dataclass(frozen=True)
-class Scene:
-    """All that the effects of assumptions depend on but the points: of one scan and one image, or of several.
-
-    Attributes:
-        camera, l_twist, image_s, period_s: as in :class:`View`.
-    """
-
-    camera: PinholeCamera
-    l_twist: FloatArray
-    image_s: float | FloatArray
-    period_s: float
-
-    @property
-    def centre(self) -> FloatArray:
-        """(2,) the principal point [px]."""
-        return np.array([self.camera.cx, self.camera.cy])
-
-    def view(self, lPs: FloatArray, offsets_s: FloatArray, uvs: FloatArray) -> View:
-        """Points of the scan as the image sees them; arguments as in :class:`View`."""
-        return View(lPs, offsets_s, uvs, self.camera, self.l_twist, self.image_s, self.period_s)
 
 
 def combined(effects: Sequence[tuple[float, Effect]]) -> Effect:

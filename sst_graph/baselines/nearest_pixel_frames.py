@@ -109,7 +109,7 @@ def match_frames(
 
 
 def frame_alignments(
-    frames: Sequence[MatchFrame], at: Calibration, pixel_weight: float, max_px: float = np.inf
+    frames: Sequence[MatchFrame], at: Calibration, pixel_weight: float, max_px: float
 ) -> list[tuple[MatchFrame, list[Alignment]]]:
     """Fresh matches of every frame that has any.
 

@@ -28,6 +28,7 @@ from sst_graph.errors import EstimationError
 from sst_graph.factors import beta_regularizer
 from sst_graph.graph.state import EXTRINSIC
 from sst_graph.odometry import metric_motions, standstill_frames
+from sst_graph.odometry.visual import DepthProvider
 from sst_graph.sampling import evenly_spread
 from sst_graph.types import Calibration, RelativeMotion, SemanticClass
 
@@ -245,29 +246,27 @@ def camera_motions(
         former: motions found earlier, by which the points are moved to the image's instant; None: at rest.
     """
     return [
-        metric_motions(drive.image_pairs, drive.camera, _Depth(drive, at, before))
+        metric_motions(drive.image_pairs, drive.camera, _depths_of(drive, at, before))
         for drive, before in zip(drives, former, strict=True)
     ]
 
 
-class _Depth:
-    """LiDAR points in the camera at an image's instant, by the image's position."""
+def _depths_of(drive: Drive, at: Calibration, former: Sequence[RelativeMotion] | None) -> DepthProvider:
+    """LiDAR points in the camera at an image's instant, of the scan of the same frame."""
+    scans = {scan.index: scan for scan in drive.scans}
 
-    def __init__(self, drive: Drive, at: Calibration, former: Sequence[RelativeMotion] | None) -> None:
-        self._drive, self._at, self._former = drive, at, former
-        self._scans = {scan.index: scan for scan in drive.scans}
-
-    def __call__(self, position: int) -> FloatArray:
-        """(m, 3) points of the scan of the same frame [m]; none where it is missing."""
-        image = self._drive.images[position]
-        scan = self._scans.get(image.index)
+    def depths(position: int) -> FloatArray:
+        image = drive.images[position]
+        scan = scans.get(image.index)
         if scan is None:
             return np.zeros((0, 3))
-        cPs = np.asarray(self._at.cTl.transformFrom(scan.depth_lPs.T.astype(np.float64))).T
-        if not self._former:
+        cPs = np.asarray(at.cTl.transformFrom(scan.depth_lPs.T.astype(np.float64))).T
+        if not former:
             return cPs
-        tau_s = self._at.time_offset_s + (image.stamp_ns - scan.stamp_ns) * 1e-9
-        return np.asarray(cPs - tau_s * velocity_at(self._former, position))
+        tau_s = at.time_offset_s + (image.stamp_ns - scan.stamp_ns) * 1e-9
+        return np.asarray(cPs - tau_s * velocity_at(former, position))
+
+    return depths
 
 
 def velocity_at(motions: Sequence[RelativeMotion], image: int) -> FloatArray:

@@ -247,7 +247,7 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
             BUDGET: total.budget,
         }
         | joint_diagnostics(problem, motion.estimate, lower),
-        JointOutcome(problem, motion.estimate, considered),
+        JointOutcome(motion.estimate, considered),
         fit,
         matched=MatchedDrives(problem, solution.state),
         by_sweeps=total.by_sweeps,

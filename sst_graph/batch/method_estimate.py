@@ -108,7 +108,7 @@ def result_of(
     weak = _weak_directions(estimate, config.observability, advice)
     wrong = (*estimate.reasons, *(_jumps(drives) if config.check_stamps else ()))
     status: Status = "not_converged" if wrong else "unobservable" if weak else "ok"
-    sentences = (f"{direction.sentence}: {direction.advice}" for direction in weak)
+    sentences = (direction.reason for direction in weak)
     return CalibrationResult(
         T_camera_lidar=estimate.cTl,
         time_offset_s=estimate.time_offset_s,

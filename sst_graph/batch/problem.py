@@ -191,14 +191,12 @@ class JointEstimate:
 
 @dataclass(frozen=True)
 class JointOutcome:
-    """A problem and its estimate, with the matches, the graph and the covariance's parts.
+    """The estimate of a problem, with the matches, the graph and the covariance's parts.
 
     Attributes:
-        problem: with the noise that it was solved with.
-        estimate: of it.
+        estimate: with the problem's solution.
         considered: what assumptions add to the covariance.
     """
 
-    problem: CalibrationProblem
     estimate: JointEstimate
     considered: Considered

@@ -40,11 +40,6 @@ class ClassMap:
         """Outputs of a network trained on these numbers: the largest of them, 255 aside, plus 1."""
         return max(number for number in self.classes if number != _IGNORED) + 1
 
-    @property
-    def known(self) -> frozenset[SemanticClass]:
-        """Classes that can be aligned and that some number means."""
-        return frozenset(self.classes.values()) - {SemanticClass.OTHER, SemanticClass.IGNORE}
-
 
 def _listed(name: str, source: str, entries: Iterable[tuple[int, str, SemanticClass]]) -> ClassMap:
     rows = list(entries)

@@ -129,8 +129,18 @@ def why_not_ok(result: CalibrationResult) -> str:
 
 def placement_before(result: CalibrationResult, source: Source) -> Placement | None:
     """What a result is compared with: its start, else the data's nominal calibration, else nothing."""
-    if result.initial is not None:
-        return Placement(result.initial, result.initial_time_offset_s, "before (start)")
+    return start_of(result) or nominal_of(source)
+
+
+def start_of(result: CalibrationResult) -> Placement | None:
+    """The start of a result, if it had one."""
+    if result.initial is None:
+        return None
+    return Placement(result.initial, result.initial_time_offset_s, "before (start)")
+
+
+def nominal_of(source: Source) -> Placement | None:
+    """The data's nominal calibration, if they bring one."""
     return None if source.nominal is None else Placement(source.nominal, 0.0, "before (nominal)")
 
 

@@ -102,7 +102,7 @@ def _merge(changes: dict[str, Any], new: Mapping[str, Any]) -> None:
             changes[key] = value
 
 
-def _built(cls: type[T], data: Mapping[str, Any], where: str, base: T | None = None) -> T:
+def _built(cls: type[T], data: Mapping[str, Any], where: str, base: T | None) -> T:
     """``base``, or without it the defaults of ``cls``, with the values of ``data``, whose names are known."""
     values: dict[str, Any] = {}
     for field, hint in settings_fields(cls):

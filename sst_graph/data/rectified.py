@@ -7,10 +7,10 @@ from dataclasses import replace
 from typing import Any, cast, overload
 
 from sst_graph.cameras import Rectification
-from sst_graph.data.frame_parts import image_at, scan_at
+from sst_graph.data.frame_parts import image_at
 from sst_graph.data.source_view import SourceView
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.types import CameraImage, Frame, Scan, Source
+from sst_graph.types import CameraImage, Frame, Source
 
 
 class RectifiedSource(SourceView):
@@ -42,10 +42,6 @@ class RectifiedSource(SourceView):
 
     def __iter__(self) -> Iterator[Frame]:
         return map(self._rectified, self.source)
-
-    def read_scan(self, position: int) -> Scan | None:
-        """Scan of the frame at a position."""
-        return scan_at(self.source, position)
 
     def read_image(self, position: int) -> CameraImage | None:
         """Rectified image of the frame at a position."""

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 
 import gtsam
 
-from sst_graph.data.frame_parts import image_positions, number_at, scan_positions
+from sst_graph.data.frame_parts import image_at, image_positions, number_at, scan_at, scan_positions
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.types import GroundTruth, Source
+from sst_graph.types import CameraImage, GroundTruth, Scan, Source
 
 
 class SourceView:
-    """What a view of a source passes on; deriving from it and giving frames, scans and images makes a
-    :class:`sst_graph.types.Source` that reads the last two separately."""
+    """What a view of a source passes on; deriving from it and giving frames, and those scans or images
+    that differ, makes a :class:`sst_graph.types.Source` that reads the last two separately."""
 
     source: Source
 
@@ -58,3 +58,11 @@ class SourceView:
     def frame_number(self, position: int) -> int:
         """Index of the frame at a position."""
         return number_at(self.source, position)
+
+    def read_scan(self, position: int) -> Scan | None:
+        """Scan of the frame at a position."""
+        return scan_at(self.source, position)
+
+    def read_image(self, position: int) -> CameraImage | None:
+        """Image of the frame at a position."""
+        return image_at(self.source, position)

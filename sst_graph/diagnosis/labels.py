@@ -54,7 +54,7 @@ def searched_classes(drives: Sequence[Drive], classes: Sequence[SemanticClass]) 
 
 def ground_points(drive: Drive) -> Finding | None:
     """Points labelled ground that lie on no plane, nor on slopes as of hills."""
-    ground = None if drive.statistics is None else usual_ground(drive.statistics)
+    ground = usual_ground(drive)
     if ground is None or ground.share >= FLAT or ground.smooth >= _SMOOTH:
         return None
     return Finding(

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from sst_graph.diagnosis.finding import Finding
 from sst_graph.diagnosis.fit import Fit
+from sst_graph.metrics import quaternion_angle_deg
 
 FloatArray = NDArray[np.float64]
 
@@ -38,7 +39,7 @@ def wrong_start(guess: gtsam.Pose3, free: Fit | None) -> Finding | None:
     """
     if free is None or free.quality < _FREE_QUALITY:
         return None
-    turned = _angle_deg(guess.rotation(), free.cTl.rotation())
+    turned = quaternion_angle_deg(guess.rotation(), free.cTl.rotation())
     if turned < _SEARCHED_DEG:
         return None
     share = 100.0 * free.explained
@@ -69,7 +70,7 @@ def other_camera(guess: gtsam.Pose3 | None, result: gtsam.Pose3, covariance: Flo
     Args:
         covariance: (7, 7) of the result.
     """
-    if guess is None or _angle_deg(guess.rotation(), result.rotation()) > _ALIGNED_DEG:
+    if guess is None or quaternion_angle_deg(guess.rotation(), result.rotation()) > _ALIGNED_DEG:
         return None
     way = result.translation() - guess.translation()
     length = float(np.linalg.norm(way))
@@ -101,7 +102,7 @@ def _converted(guess: gtsam.Rot3, found: gtsam.Rot3, factor: float) -> bool:
             angles = Rotation.from_matrix(_right_angled(R)).as_euler(sequence)
         right = 0.5 * np.pi * np.round(angles / (0.5 * np.pi))
         wrong = Rotation.from_euler(sequence, right * factor).as_matrix()
-        if _angle_deg(gtsam.Rot3(wrong.T if inverse else wrong), gtsam.Rot3(wanted)) < _NEAR_DEG:
+        if quaternion_angle_deg(gtsam.Rot3(wrong.T if inverse else wrong), gtsam.Rot3(wanted)) < _NEAR_DEG:
             return True
     return False
 
@@ -113,9 +114,5 @@ def _right_angled(R: FloatArray) -> FloatArray:
     rounded[np.arange(3), rows] = np.sign(R[np.arange(3), rows])
     if len(set(rows.tolist())) < 3 or np.linalg.det(rounded) < 0.0:
         return R
-    near = _angle_deg(gtsam.Rot3(rounded), gtsam.Rot3.ClosestTo(R)) < _DESIGN_DEG
+    near = quaternion_angle_deg(gtsam.Rot3(rounded), gtsam.Rot3.ClosestTo(R)) < _DESIGN_DEG
     return rounded if near else R
-
-
-def _angle_deg(one: gtsam.Rot3, other: gtsam.Rot3) -> float:
-    return float(np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(one.between(other)))))

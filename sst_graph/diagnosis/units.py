@@ -37,7 +37,7 @@ def clouds(drive: Drive) -> Finding | None:
     if drive.statistics is None:
         return None
     heights = vehicle_heights(drive.statistics)
-    ground = usual_ground(drive.statistics)
+    ground = usual_ground(drive)
     if len(heights) < _LEAST_VEHICLES or (ground is not None and ground.share < FLAT):
         return None
     middle, upper = float(np.median(heights)), float(np.quantile(heights, 0.75))
@@ -75,7 +75,7 @@ def clouds(drive: Drive) -> Finding | None:
 
 def axes(drive: Drive, guess: gtsam.Pose3 | None) -> Finding | None:
     """Clouds in the camera's axes under a start that is not made for them: the ground shows what is down."""
-    ground = None if drive.statistics is None else usual_ground(drive.statistics)
+    ground = usual_ground(drive)
     if ground is None or ground.share < FLAT or ground.up[1] > -_UPRIGHT:
         return None
     if guess is not None and float((guess.rotation().matrix() @ ground.up)[1]) < -_UPRIGHT:
@@ -90,7 +90,7 @@ def axes(drive: Drive, guess: gtsam.Pose3 | None) -> Finding | None:
 
 def origin(drive: Drive) -> Finding | None:
     """Clouds whose origin lies on the ground: no LiDAR is there."""
-    ground = None if drive.statistics is None else usual_ground(drive.statistics)
+    ground = usual_ground(drive)
     if ground is None or ground.share < FLAT or ground.height > 0.5 * ground.tolerance:
         return None
     return Finding(
@@ -124,9 +124,10 @@ def vehicle_heights(statistics: InputStatistics) -> FloatArray:
     return np.concatenate([np.zeros(0), *(scan.vehicle_heights for scan in statistics.scans)])
 
 
-def usual_ground(statistics: InputStatistics) -> Ground | None:
+def usual_ground(drive: Drive) -> Ground | None:
     """The median ground of the scans; None where fewer than half of those looked at closely show one."""
-    grounds: Sequence[Ground] = [scan.ground for scan in statistics.scans if scan.ground is not None]
+    scans = () if drive.statistics is None else drive.statistics.scans
+    grounds: Sequence[Ground] = [scan.ground for scan in scans if scan.ground is not None]
     if not grounds:
         return None
     up = np.median([ground.up for ground in grounds], axis=0)

@@ -26,9 +26,8 @@ from sst_graph.drive.preparation import (
 from sst_graph.errors import DataError, count_of
 from sst_graph.files.array_store import ArrayStore
 from sst_graph.odometry.features import FeatureTracker
-from sst_graph.odometry.relative import relative_pose
 from sst_graph.odometry.sweep import SweptSource
-from sst_graph.odometry.visual import ImagePair
+from sst_graph.odometry.visual import ImagePair, next_pair
 from sst_graph.types import Frame, SemanticClass, Source
 from sst_graph.validation import checked_image
 
@@ -38,7 +37,7 @@ def with_camera(
     source: Source,
     classes: Sequence[SemanticClass],
     config: PrepareConfig,
-    progress: Progress | None = None,
+    progress: Progress | None,
 ) -> Drive:
     """The drive with the images of another camera; its scans, motions and sweep are shared.
 
@@ -95,10 +94,10 @@ def _images(
         frame = Frame(index, None, image)
         left_out.add(frame)
         collector.add(frame)
-        if config.use_visual_odometry and tracker.seconds_to(image) >= config.track_interval_s:
-            tracks = tracker.add(image)
-            if tracks is not None:
-                pairs.append(ImagePair(tracks, relative_pose(tracks, source.camera)))
+        if config.use_visual_odometry:
+            pair = next_pair(tracker, image, source.camera, config.track_interval_s)
+            if pair is not None:
+                pairs.append(pair)
         images.append(image_features(index, image, classes, config.image_edges).stored_in(store))
     return images, pairs, left_out, collector.statistics()
 

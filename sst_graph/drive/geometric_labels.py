@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from sst_graph.data.frame_parts import frame_at, image_at, scan_at
+from sst_graph.data.frame_parts import frame_at, scan_at
 from sst_graph.data.source_view import SourceView
 from sst_graph.features.compact_objects import find_compact_objects
 from sst_graph.features.ground import on_ground
-from sst_graph.types import CameraImage, Frame, Scan, SemanticClass, Source
+from sst_graph.types import Frame, Scan, SemanticClass, Source
 
 _NEAREST_M = 1.5
 """Nearer points may be of the own vehicle [m]."""
@@ -36,10 +36,6 @@ class GeometricallyLabelled(SourceView):
         """Scan of the frame at a position."""
         scan = scan_at(self.source, position)
         return None if scan is None else labelled_by_geometry(scan)
-
-    def read_image(self, position: int) -> CameraImage | None:
-        """Image of the frame at a position."""
-        return image_at(self.source, position)
 
 
 def labelled_by_geometry(scan: Scan) -> Scan:

@@ -15,20 +15,19 @@ from sst_graph.config import Settings, internal
 from sst_graph.data.frame_parts import NumberedFrames
 from sst_graph.drive.geometric_labels import labelled_by_geometry
 from sst_graph.drive.input_statistics import InputStatistics, StatisticsCollector
-from sst_graph.drive.trajectory import GrowingTrack, TwistTrack
+from sst_graph.drive.twists import GrowingTwists, SensorTwists
 from sst_graph.errors import DataError, count_of
 from sst_graph.factors.arguments import checked_callback
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.features.lidar_edges import MAX_RANGE_M, Boundaries, Edge, find_boundaries
+from sst_graph.features.lidar_edges import MAX_RANGE_M, Boundaries, Edge, find_boundaries, with_points
 from sst_graph.features.mask_contour import ContourMap
 from sst_graph.features.picture_gradients import PictureGradients
 from sst_graph.files.array_store import IN_MEMORY_BYTES, ArrayStore, storable
 from sst_graph.files.object_store import PackedArray
 from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
-from sst_graph.odometry.relative import relative_pose
 from sst_graph.odometry.sweep import SweepDecision, SweptSource
-from sst_graph.odometry.visual import ImagePair
+from sst_graph.odometry.visual import ImagePair, next_pair
 from sst_graph.types import CameraImage, Frame, RelativeMotion, Scan, SemanticClass, Source
 from sst_graph.validation import checked_frame, checked_image, checked_scan
 
@@ -308,13 +307,13 @@ class Drive:
         stamps = self.scan_stamps_ns
         return float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else 0.1
 
-    def lidar_track(self, growing: GrowingTrack | None = None) -> TwistTrack | None:
+    def lidar_twists(self, growing: GrowingTwists | None) -> SensorTwists | None:
         """Twists of the LiDAR over time, smoothed, exactly zero at standstill; None for a single scan.
 
         Args:
             growing: cache that holds the motions of earlier calls.
         """
-        return (growing or GrowingTrack()).of(self.lidar_motions)
+        return (growing or GrowingTwists()).of(self.lidar_motions)
 
 
 def prepare_drive(
@@ -354,10 +353,10 @@ def prepare_drive(
             features = scan_features(frame.index, frame.scan, classes, config, depth, with_lower_edges)
             scans.append(features.stored_in(store))
         if frame.image is not None:
-            if config.use_visual_odometry and tracker.seconds_to(frame.image) >= config.track_interval_s:
-                tracks = tracker.add(frame.image)
-                if tracks is not None:
-                    pairs.append(ImagePair(tracks, relative_pose(tracks, source.camera)))
+            if config.use_visual_odometry:
+                pair = next_pair(tracker, frame.image, source.camera, config.track_interval_s)
+                if pair is not None:
+                    pairs.append(pair)
             contours = image_features(frame.index, frame.image, classes, config.image_edges)
             images.append(contours.stored_in(store))
         if progress is not None:
@@ -443,10 +442,7 @@ def apart(
         boundaries[c] = points.take(np.flatnonzero(~down))
         known = np.isin(points.objects, boundaries[c].objects)
         lower_edges[c] = points.take(np.flatnonzero(down & known))
-    return (
-        {c: points for c, points in boundaries.items() if len(points)},
-        {c: points for c, points in lower_edges.items() if len(points)},
-    )
+    return with_points(boundaries), with_points(lower_edges)
 
 
 def boundaries_of(

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from sst_graph.edges.agreement import BlurredScore
 from sst_graph.graph.matching import DriveEdges
 from sst_graph.graph.state import State
+from sst_graph.metrics import quaternion_angle_deg
 from sst_graph.stepwise import Stepwise
 
 FloatArray = NDArray[np.float64]
@@ -135,7 +136,7 @@ def _apart(a: State, b: State) -> bool:
 
 def angle_deg(a: gtsam.Pose3, b: gtsam.Pose3) -> float:
     """Angle between two rotations [deg]."""
-    return float(np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(a.rotation().between(b.rotation())))))
+    return quaternion_angle_deg(a.rotation(), b.rotation())
 
 
 def turned(cTl: gtsam.Pose3, turns_rad: FloatArray) -> FloatArray:

@@ -153,9 +153,6 @@ def _row(scenario: Scenario, outcomes: Sequence[Outcome]) -> str:
     translation = _spread([100.0 * e.atd_m for e in errors], 2)
     standing = scenario.drive.get("motion") == "standing"
     time_offset = "–" if standing else _spread([1e3 * abs(e.time_offset_s or 0.0) for e in errors], 2)
-    nees = [e.nees for e in errors if e.nees is not None]
-    means = [np.mean([getattr(n, part) for n in nees]) for part in ("rotation", "translation", "joint")]
-    counts = [sum(o.status == s for o in outcomes) for s in ("ok", "unobservable", "not_converged")]
     cells = [
         scenario.title,
         str(len(outcomes)),
@@ -163,10 +160,22 @@ def _row(scenario: Scenario, outcomes: Sequence[Outcome]) -> str:
         rotation,
         translation,
         time_offset,
-        ", ".join(f"{mean:.1f}" for mean in means),
-        " / ".join(map(str, counts)),
+        mean_nees(errors),
+        status_counts([outcome.status for outcome in outcomes]),
     ]
     return "| " + " | ".join(cells) + " |"
+
+
+def mean_nees(errors: Sequence[CalibrationErrors]) -> str:
+    """Mean NEES of rotation, translation and all seven unknowns."""
+    nees = [e.nees for e in errors if e.nees is not None]
+    means = [np.mean([getattr(n, part) for n in nees]) for part in ("rotation", "translation", "joint")]
+    return ", ".join(f"{mean:.1f}" for mean in means)
+
+
+def status_counts(statuses: Sequence[str]) -> str:
+    """How many are ok, unobservable and not converged."""
+    return " / ".join(str(statuses.count(s)) for s in ("ok", "unobservable", "not_converged"))
 
 
 def _spread(values: Sequence[float], digits: int) -> str:

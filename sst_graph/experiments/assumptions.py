@@ -123,7 +123,7 @@ def run(config: AssumptionTableConfig, progress: Progress | None = None) -> str:
     return table(list(runs_of(config, progress)), config.in_sigmas)
 
 
-def runs_of(config: AssumptionTableConfig, progress: Progress | None = None) -> Iterator[Run]:
+def runs_of(config: AssumptionTableConfig, progress: Progress | None) -> Iterator[Run]:
     """All calibrations of the table: street by street, each simulated once."""
     cases = [
         (name, sign * size)

@@ -19,6 +19,7 @@ from sst_graph.data import open_source
 from sst_graph.drive.preparation import Progress
 from sst_graph.errors import ConfigError, count_of
 from sst_graph.experiments.resumable import Work, rows_of
+from sst_graph.experiments.starts import truth_of
 from sst_graph.metrics import calibration_errors
 from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.types import Source
@@ -143,9 +144,7 @@ def runs_of(task: Task) -> list[BasinRun]:
     """
     config = task.config
     source = _source(task)
-    truth = source.truth
-    if truth is None:
-        raise ConfigError(f"{source.name}: found no reference calibration, expected one")
+    truth = truth_of(source)
     drives = prepare_drives([source], config.calibration)
     found = []
     for search_deg, search_m, starts in zip(
@@ -202,11 +201,11 @@ def _angle_within(largest: float, rng: np.random.Generator) -> float:
             return angle
 
 
-def binomial_bounds(count: int, of: int, confidence: float = _CONFIDENCE) -> tuple[float, float]:
+def binomial_bounds(count: int, of: int) -> tuple[float, float]:
     """Exact bounds of a probability that showed ``count`` times in ``of`` (Clopper and Pearson, 1934)."""
     from scipy.stats import beta
 
-    tail = 0.5 * (1.0 - confidence)
+    tail = 0.5 * (1.0 - _CONFIDENCE)
     low = 0.0 if count == 0 else float(beta.ppf(tail, count, of - count + 1))
     high = 1.0 if count == of else float(beta.ppf(1.0 - tail, count + 1, of - count))
     return low, high

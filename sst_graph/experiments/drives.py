@@ -13,9 +13,9 @@ from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drive
 from sst_graph.config import Settings, setting
 from sst_graph.data import open_source
 from sst_graph.drive.preparation import Drive, Progress
-from sst_graph.drive.trajectory import camera_twist
+from sst_graph.drive.twists import camera_twist
 from sst_graph.errors import ConfigError
-from sst_graph.experiments.starts import start_near
+from sst_graph.experiments.starts import start_near, truth_of
 from sst_graph.graph.matching import Tracks
 from sst_graph.metrics import CalibrationErrors, calibration_errors
 from sst_graph.result import CalibrationResult
@@ -76,9 +76,7 @@ _HEADER = (
 
 def _row(sources: Sequence[Source], drives: Sequence[Drive], shift: int, config: DrivesConfig) -> str:
     """One drive, or several in one graph, from all starts."""
-    truth = sources[0].truth
-    if truth is None:
-        raise ConfigError(f"{sources[0].name}: found no reference calibration, expected one")
+    truth = truth_of(sources[0])
     rng = np.random.default_rng([config.seed, shift])
     results = []
     for _ in range(config.starts):

@@ -13,6 +13,7 @@ from sst_graph.batch import CalibrationConfig, calibrate_prepared
 from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import Progress, prepare_drive
 from sst_graph.errors import ConfigError
+from sst_graph.experiments.accuracy import mean_nees, status_counts
 from sst_graph.experiments.starts import start_near
 from sst_graph.metrics import CalibrationErrors, calibration_errors
 from sst_graph.result import Status
@@ -131,17 +132,14 @@ _RULE = "|---|---|---|---|---|---|---|---|"
 
 def _row(name: str, label: str, outcomes: Sequence[Outcome]) -> str:
     errors = [outcome.errors for outcome in outcomes]
-    nees = [e.nees for e in errors if e.nees is not None]
-    means = [np.mean([getattr(n, part) for n in nees]) for part in ("rotation", "translation", "joint")]
-    counts = [sum(o.status == s for o in outcomes) for s in ("ok", "unobservable", "not_converged")]
     cells = [
         name,
         label,
         _spread([e.qad_deg for e in errors], 3),
         _spread([100.0 * e.atd_m for e in errors], 2),
         _spread([1e3 * abs(e.time_offset_s or 0.0) for e in errors], 2),
-        ", ".join(f"{mean:.1f}" for mean in means),
-        " / ".join(map(str, counts)),
+        mean_nees(errors),
+        status_counts([outcome.status for outcome in outcomes]),
         f"{np.median([o.seconds for o in outcomes]):.1f}",
     ]
     return "| " + " | ".join(cells) + " |"

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from sst_graph.batch import CalibrationConfig, calibrate_prepared
 from sst_graph.config import Settings, setting
+from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import Progress, prepare_drive
 from sst_graph.experiments.slam_graph import (
     EXTRINSIC,
@@ -30,7 +31,7 @@ from sst_graph.experiments.slam_graph import (
 )
 from sst_graph.odometry import RegisteredScan, loop_closures, scan_to_scan
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
-from sst_graph.types import Calibration, Frame
+from sst_graph.types import Calibration
 
 FloatArray = NDArray[np.float64]
 
@@ -96,34 +97,16 @@ class SlamConfig(Settings):
 
 
 @dataclass(frozen=True)
-class Recording:
-    """A drive held in memory (satisfies :class:`sst_graph.types.Source`), for two passes."""
-
-    source: SimulatedDrive
-    frames: tuple[Frame, ...]
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.source, name)
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def __getitem__(self, position: int) -> Frame:
-        return self.frames[position]
-
-
-@dataclass(frozen=True)
 class Street:
     """One street's outcome.
 
     Attributes:
-        weather, seed: which.
+        weather: of the street.
         closures: number of loop closures.
         errors: of each of :data:`ROWS`, by the names of :data:`MEASURES`; those that apply.
     """
 
     weather: str
-    seed: int
     closures: int
     errors: Mapping[str, Mapping[str, float]]
 
@@ -143,9 +126,9 @@ def solve_street(config: SlamConfig, weather: str, seed: int) -> Street:
     """SLAM alone, calibration alone, and both, on one street."""
     street = dataclasses.replace(config.street, seed=seed, frames=config.frames, **WEATHERS[weather])
     source = simulate(dataclasses.replace(street, time_offset_s=config.time_offset_s))
-    frames = tuple(source)
-    drive = prepare_drive(Recording(source, frames), config.calibration.classes, config.calibration.prepare)
-    scans = [RegisteredScan(frame.scan) for frame in frames if frame.scan is not None]
+    kept = KeptDrive.of(source)
+    drive = prepare_drive(kept, config.calibration.classes, config.calibration.prepare)
+    scans = [RegisteredScan(frame.scan) for frame in kept.frames if frame.scan is not None]
     # 1. SLAM alone: LiDAR odometry, loop closures.
     graph, odometry = pose_graph(scan_to_scan(scans))
     poses = [odometry.atPose3(pose_key(k)) for k in range(len(scans))]
@@ -164,7 +147,7 @@ def solve_street(config: SlamConfig, weather: str, seed: int) -> Street:
         "calibration alone": calibration_errors(start.cTl, start.time_offset_s, source),
         "both": trajectory_errors(both, source) | calibration_errors(*found, source),
     }
-    return Street(weather, seed, len(closures), errors)
+    return Street(weather, len(closures), errors)
 
 
 def trajectory_errors(values: gtsam.Values, source: SimulatedDrive) -> dict[str, float]:

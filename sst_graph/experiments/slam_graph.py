@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sst_graph.association.edge_matching import MatchConfig
 from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import Drive
-from sst_graph.drive.trajectory import TwistTrack
+from sst_graph.drive.twists import SensorTwists
 from sst_graph.factors import (
     Between,
     CameraMotion,
@@ -151,14 +151,14 @@ def _places(drive: Drive, values: gtsam.Values) -> list[_Place]:
         RelativeMotion(stamps[k], stamps[k + 1], a.between(b), np.eye(6))
         for k, (a, b) in enumerate(itertools.pairwise(poses))
     ]
-    track, offset_ns = TwistTrack(motions), round(1e9 * float(values.atVector(TIME_OFFSET)[0]))
+    twists, offset_ns = SensorTwists(motions), round(1e9 * float(values.atVector(TIME_OFFSET)[0]))
     places = []
     for stamp_ns in drive.image_stamps_ns:
         true_ns = stamp_ns + offset_ns
         scan = int(np.clip(np.searchsorted(stamps, true_ns, "right") - 1, 0, len(stamps) - 2))
         seconds = (stamps[scan + 1] - stamps[scan]) * 1e-9
         between = Between(pose_key(scan), pose_key(scan + 1), seconds, (stamp_ns - stamps[scan]) * 1e-9)
-        sample = track.at(true_ns)
+        sample = twists.at(true_ns)
         places.append(_Place(scan, between, sample.twist, sample.acceleration))
     return places
 

@@ -99,7 +99,7 @@ def find_picture_edges(
     inside: NDArray[np.uint8],
     distance: FloatMap,
     picture: Picture,
-    outside: NDArray[np.uint8] | None = None,
+    outside: NDArray[np.uint8] | None,
 ) -> PictureEdges:
     """What the picture shows along the contours of a region.
 

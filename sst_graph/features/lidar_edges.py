@@ -9,7 +9,7 @@ return, and a camera beside the LiDAR sees the difference.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from enum import IntEnum
 
@@ -103,6 +103,11 @@ class Boundaries:
             self.edges[index],
             self.objects[index],
         )
+
+
+def with_points(found: Mapping[SemanticClass, Boundaries]) -> dict[SemanticClass, Boundaries]:
+    """Without the classes that have no points."""
+    return {c: points for c, points in found.items() if len(points)}
 
 
 def joined(parts: Sequence[Boundaries]) -> Boundaries:

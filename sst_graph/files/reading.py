@@ -22,7 +22,7 @@ from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
-from sst_graph.errors import DataError, count_of
+from sst_graph.errors import DataError, count_of, first_line
 from sst_graph.factors.arguments import described
 
 MAX_DEPTH = 64
@@ -199,7 +199,7 @@ def _parsed(
     except RecursionError:
         raise DataError(place, f"{language} nested too deeply", f"at most {max_depth} levels") from None
     except ValueError as error:  # JSONDecodeError, TOMLDecodeError and those of the hooks below
-        raise DataError(place, f"no {language} ({_first_line(error)})", expected) from None
+        raise DataError(place, f"no {language} ({first_line(error)})", expected) from None
     return value
 
 
@@ -254,10 +254,6 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         twice, _ = Counter(key for key, _ in pairs).most_common(1)[0]
         raise ValueError(f"the key {twice!r:.60} twice")
     return table
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 def _require_regular(status: os.stat_result, path: str | Path, kind: FileKind) -> None:

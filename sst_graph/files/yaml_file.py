@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from sst_graph.errors import DataError, MissingDependencyError, count_of
+from sst_graph.errors import DataError, MissingDependencyError, count_of, one_line
 from sst_graph.files.reading import FileKind, read_text
 
 YAML = FileKind("a YAML file", 64 * 1024)
@@ -55,8 +55,9 @@ def parse_yaml(text: str, place: str | Path) -> dict[str, Any]:
         _check_events(yaml, text)
         value = yaml.load(text, Loader)  # a SafeLoader
     except (yaml.YAMLError, ValueError, TypeError, OverflowError, AttributeError, RecursionError) as error:
-        line = " ".join(str(error).split()) or type(error).__name__
-        raise DataError(place, f"no YAML ({line:.200})", "numbers, text, lists and tables") from None
+        raise DataError(
+            place, f"no YAML ({one_line(error):.200})", "numbers, text, lists and tables"
+        ) from None
     if not isinstance(value, dict):
         raise DataError(place, f"a YAML {type(value).__name__}", "a table")
     return value

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import Any
 
-from sst_graph.errors import ConfigError, MissingDependencyError, count_of
+from sst_graph.errors import ConfigError, MissingDependencyError, count_of, one_line
 from sst_graph.fleet.attempt import Job
 from sst_graph.fleet.record import Record
 
@@ -131,11 +131,12 @@ def _outcome(future: Any) -> Record | BaseException | None:
 
 def _failure(job: Job, error: BaseException, is_lost: bool) -> Record:
     """Why a task gave nothing: its workers were lost, or one could not run it."""
-    words = " ".join(str(error).split()) or type(error).__name__
     name, place = job.drive.name, job.drive.place.url
     if is_lost:
-        return Record(name, place, "killed", f"its Dask workers were lost, all that it had: {words:.500}")
-    return Record(name, place, "crash", f"could not be run on its Dask worker: {words:.500}")
+        return Record(
+            name, place, "killed", f"its Dask workers were lost, all that it had: {one_line(error):.500}"
+        )
+    return Record(name, place, "crash", f"could not be run on its Dask worker: {one_line(error):.500}")
 
 
 def _client(distributed: Any, cluster: Cluster) -> Any:

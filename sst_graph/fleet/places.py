@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sst_graph.errors import DataError, MissingDependencyError
+from sst_graph.errors import DataError, MissingDependencyError, one_line
 from sst_graph.files import MANIFEST, atomic_write_bytes
 
 _URL = re.compile(r"^[a-z][a-z0-9+.-]*://", re.IGNORECASE)
@@ -245,5 +245,4 @@ class _asked:
             return
         if isinstance(error, FileNotFoundError):
             raise DataError(self._place.url, "nothing", "a file or a folder") from error
-        words = " ".join(str(error).split()) or type(error).__name__
-        raise DataError(self._place.url, words, "a place that can be read and written") from error
+        raise DataError(self._place.url, one_line(error), "a place that can be read and written") from error

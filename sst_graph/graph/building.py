@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.assumptions import ASSUMPTIONS, named_sigmas
-from sst_graph.drive.trajectory import camera_twist
+from sst_graph.drive.twists import camera_twist
 from sst_graph.factors import (
     GroupedBias,
     LidarTwist,
@@ -86,7 +86,7 @@ def silhouettes_factor(
     D: int,
     V: int,
     bias_of: Callable[[SemanticClass], int],
-    nuisances: Mapping[str, float] | None = None,
+    nuisances: Mapping[str, float] | None,
 ) -> gtsam.CustomFactor:
     """All silhouette matches of one pair as one condensed factor on extrinsic, offset, twist and mask biases.
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.assumptions import named_sigmas
-from sst_graph.drive.trajectory import camera_covariances
+from sst_graph.drive.twists import camera_covariances
 from sst_graph.factors.matches import Alignment
 from sst_graph.factors.motion import CameraTwist, move_groups
 from sst_graph.factors.reprojection import Evaluated, evaluate, evaluate_moved, weigh

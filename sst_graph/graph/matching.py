@@ -31,7 +31,7 @@ from sst_graph.assumptions import named_sigmas
 from sst_graph.assumptions.model import Scene
 from sst_graph.config import internal, setting
 from sst_graph.drive.preparation import Drive, boundaries_of
-from sst_graph.drive.trajectory import GrowingTrack, TwistSample, TwistSamples, TwistTrack
+from sst_graph.drive.twists import GrowingTwists, SensorTwists, TwistSample, TwistSamples
 from sst_graph.errors import ConfigError
 from sst_graph.factors.matches import Alignment
 from sst_graph.factors.motion import CameraTwist
@@ -151,10 +151,10 @@ class Tracks:
         self,
         drives: Sequence[Drive],
         objects: Sequence[Mapping[ObjectId, int]] | None = None,
-        growing: GrowingTrack | None = None,
+        growing: GrowingTwists | None = None,
     ) -> None:
         """growing: of a single drive whose motions grow."""
-        self._tracks: list[TwistTrack | None] = [drive.lidar_track(growing) for drive in drives]
+        self._twists: list[SensorTwists | None] = [drive.lidar_twists(growing) for drive in drives]
         self.objects: Sequence[Mapping[ObjectId, int]] | None = objects
         found = zip(drives, objects, strict=True) if objects is not None else ()
         self._dynamic = [_by_scan(find_dynamic_objects(drive, tracks)) for drive, tracks in found]
@@ -164,13 +164,13 @@ class Tracks:
     ) -> Tracks:
         """The same twists of one drive, with other object tracks and dynamic objects."""
         other = Tracks([])
-        other._tracks, other.objects, other._dynamic = self._tracks, [objects], [_by_scan(dynamic)]
+        other._twists, other.objects, other._dynamic = self._twists, [objects], [_by_scan(dynamic)]
         return other
 
     def part(self, drive: int, scans: Sequence[int]) -> Tracks:
         """The tracks of some scans of one drive (:meth:`Drive.part`), which becomes drive 0."""
         other, place = Tracks([]), {position: k for k, position in enumerate(scans)}
-        other._tracks = [self._tracks[drive]]
+        other._twists = [self._twists[drive]]
         if self.objects is not None:
             other.objects = [tracks_of_scans(self.objects[drive], scans)]
             moving = self._dynamic[drive]
@@ -181,7 +181,7 @@ class Tracks:
     def joined(cls, parts: Sequence[Tracks]) -> Tracks:
         """The tracks of several drives, each given by itself."""
         other = cls([])
-        other._tracks = [track for part in parts for track in part._tracks]
+        other._twists = [twists for part in parts for twists in part._twists]
         if all(part.objects is not None for part in parts):
             other.objects = [own for part in parts for own in part.objects or ()]
             other._dynamic = [own for part in parts for own in part._dynamic]
@@ -193,13 +193,13 @@ class Tracks:
 
     def at(self, drive: int, stamp_ns: int) -> TwistSample | None:
         """The LiDAR's twist at a stamp of its clock, or None without odometry."""
-        track = self._tracks[drive]
-        return None if track is None else track.at(stamp_ns)
+        twists = self._twists[drive]
+        return None if twists is None else twists.at(stamp_ns)
 
     def at_all(self, drive: int, stamps_ns: Sequence[int]) -> TwistSamples | None:
         """The LiDAR's twists at stamps of its clock, or None without odometry."""
-        track = self._tracks[drive]
-        return None if track is None else track.at_all(stamps_ns)
+        twists = self._twists[drive]
+        return None if twists is None else twists.at_all(stamps_ns)
 
 
 @dataclass(frozen=True)

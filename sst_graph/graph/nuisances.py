@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sst_graph.assumptions import ASSUMPTIONS, Effect, combined
 from sst_graph.assumptions.model import Scene
-from sst_graph.drive.trajectory import TwistSamples
+from sst_graph.drive.twists import TwistSamples
 from sst_graph.factors.alignment import Alignment, residuals
 from sst_graph.factors.motion import CameraTwist, moved_points
 

@@ -164,7 +164,7 @@ def solve_joint(
 def solve_joint_steps(
     problem: JointProblem,
     start: State,
-    kernels_px: Sequence[float] = KERNELS_PX,
+    kernels_px: Sequence[float],
     progress: Progress | None = None,
     step_sigmas: float = STEP_SIGMAS,
 ) -> Stepwise[JointSolution]:
@@ -215,7 +215,7 @@ def solve_all(
     problem: JointProblem,
     starts: Sequence[tuple[State, State]],
     kernels_px: Sequence[float],
-    progress: Progress | None = None,
+    progress: Progress | None,
 ) -> list[JointSolution]:
     """Solutions from (start, what the weak priors are centred on), the one that agrees best first.
 

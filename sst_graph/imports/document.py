@@ -10,7 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from sst_graph.errors import DataError, count_of
+from sst_graph.errors import DataError, count_of, one_line
 from sst_graph.files.reading import CALIBRATION, FileKind, parse_json, read_text
 from sst_graph.files.yaml_file import YAML, parse_yaml
 
@@ -87,8 +87,7 @@ class Document:
                 warnings.simplefilter("ignore")  # of odd escapes and literals in the text
                 return ast.parse(self.text)
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-            line = " ".join(str(error).split()) or type(error).__name__
-            raise DataError(self.path, f"no Python ({line:.200})", ANY.name) from None
+            raise DataError(self.path, f"no Python ({one_line(error):.200})", ANY.name) from None
 
     def _check_length(self, language: str) -> None:
         most = _MOST_CHARACTERS[language]

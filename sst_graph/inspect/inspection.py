@@ -222,10 +222,17 @@ def redundant_frames(frames: Sequence[FrameInformation], share: float) -> tuple[
     return tuple(k for k, frame in enumerate(frames) if frame.without.max() <= 1.0 + share)
 
 
-def telling_frames(frames: Sequence[FrameInformation], unknown: int, count: int = 3) -> list[int]:
-    """Positions of the frames that matter most for one unknown, the most important first."""
+def telling_frames(frames: Sequence[FrameInformation], unknown: int) -> list[int]:
+    """Positions of the three frames that matter most for one unknown, the most important first."""
     order = np.argsort([-frame.without[unknown] for frame in frames], kind="stable")
-    return [int(k) for k in order[:count] if frames[int(k)].without[unknown] > 1.0]
+    return [int(k) for k in order[:3] if frames[int(k)].without[unknown] > 1.0]
+
+
+def sigma_ellipse(covariance: FloatArray, count: int) -> FloatArray:
+    """(2, count) closed line of one sigma around the origin, of a covariance (2, 2)."""
+    circle = np.stack([np.cos(t := np.linspace(0.0, 2.0 * np.pi, count)), np.sin(t)])
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * circle))
 
 
 def to_dict(inspection: Inspection) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.assumptions import ASSUMPTIONS
-from sst_graph.assumptions.model import View
+from sst_graph.assumptions.model import Scene, View
 from sst_graph.files.checked_values import is_number
 from sst_graph.result import CalibrationResult
 
@@ -69,7 +69,7 @@ def _view(result: CalibrationResult, cP: FloatArray) -> View:
     """The point, at rest."""
     camera = result.camera
     lP = result.T_camera_lidar.transformTo(cP)
-    return View(lP[None], np.zeros(1), camera.project(cP[None]), camera, np.zeros(6), 0.0, 0.1)
+    return Scene(camera, np.zeros(6), 0.0, 0.1).view(lP[None], np.zeros(1), camera.project(cP[None]))
 
 
 def _numbers(values: Any, count: int) -> FloatArray | None:

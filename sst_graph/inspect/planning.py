@@ -288,15 +288,15 @@ def driving_axes(cTl: gtsam.Pose3, frames: Sequence[FrameInformation]) -> tuple[
     return forward, up / length if length > 0.1 else -R.T[:, 1]
 
 
-def nearer(view: FloatArray, cTl: gtsam.Pose3, factor: float = 2.0) -> FloatArray:
-    """The view with everything ``factor`` times nearer to the camera: a shift moves the image that much more.
+def nearer(view: FloatArray, cTl: gtsam.Pose3) -> FloatArray:
+    """The view with everything twice as near to the camera: a shift moves the image twice as far.
 
     Counted about the camera's centre; the points per object, which grow too, stay as they are.
     """
     # Right perturbations at the LiDAR -> left perturbations at the camera, where depth scales translation.
     Ad = np.asarray(cTl.AdjointMap())
     to_camera = np.linalg.inv(Ad)
-    scale = np.repeat([1.0, factor], 3)
+    scale = np.repeat([1.0, 2.0], 3)
     in_camera = to_camera.T @ view @ to_camera * np.outer(scale, scale)
     return np.asarray(Ad.T @ in_camera @ Ad)
 

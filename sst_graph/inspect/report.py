@@ -10,7 +10,7 @@ import numpy as np
 
 from sst_graph.inspect.budget_text import budget_lines, estimated_lines
 from sst_graph.inspect.reasons import short_reasons
-from sst_graph.inspect.verdict import fit_line, verdict
+from sst_graph.inspect.verdict import figure, fit_line, verdict
 from sst_graph.metrics import (
     CalibrationErrors,
     euler_angles_deg,
@@ -206,6 +206,4 @@ def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
 
 def _short(value: float) -> str:
     """Two significant digits, without an exponent below a million."""
-    if value == 0.0 or value >= 1e6:
-        return f"{value:.2g}"
-    return f"{value:.{max(0, 1 - int(np.floor(np.log10(value))))}f}"
+    return f"{value:.2g}" if value >= 1e6 else figure(value)

@@ -108,7 +108,7 @@ class DynamicObjectTest:
         scan: ScanFeatures,
         tracks: Mapping[ObjectName, int],
         wTl: gtsam.Pose3,
-        first: int = 0,
+        first: int,
     ) -> None:
         """Test with the next scan.
 

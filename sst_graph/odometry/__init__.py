@@ -10,13 +10,7 @@ from sst_graph.odometry.registration import (
     scan_to_scan,
 )
 from sst_graph.odometry.standstill import standstill_frames
-from sst_graph.odometry.visual import (
-    ImagePair,
-    VisualOdometry,
-    image_pairs,
-    metric_motions,
-    visual_odometry,
-)
+from sst_graph.odometry.visual import ImagePair, image_pairs, metric_motions, next_pair
 
 __all__ = [
     "ImagePair",
@@ -24,12 +18,11 @@ __all__ = [
     "LidarOdometryConfig",
     "LoopClosure",
     "RegisteredScan",
-    "VisualOdometry",
     "image_pairs",
     "lidar_odometry",
     "loop_closures",
     "metric_motions",
+    "next_pair",
     "scan_to_scan",
     "standstill_frames",
-    "visual_odometry",
 ]

@@ -195,7 +195,7 @@ class LidarOdometry:
             missed = cloud.size() - result.num_inliers
             misfit = (2.0 * result.error + _MISSED_COST * missed) / cloud.size()
             if np.isfinite(found).all() and misfit < least:
-                best, least, paired = _orthonormal(found), misfit, result.num_inliers / cloud.size()
+                best, least, paired = orthonormal(found), misfit, result.num_inliers / cloud.size()
             stands = float(np.linalg.norm(best[:3, 3] - wTl[:3, 3])) < _STANDSTILL_M
             if number == _AROUND and stands and paired >= _STANDSTILL_INLIER_RATIO:
                 return best
@@ -231,7 +231,7 @@ class LidarOdometry:
         found = np.asarray(result.T_target_source)
         if not np.isfinite(found).all() or result.num_inliers < _MIN_INLIER_RATIO * cloud.size():
             return None
-        found = _orthonormal(found)
+        found = orthonormal(found)
         twist = _log(np.linalg.inv(self._wTl) @ found) / seconds
         return _Registration(found, cloud, twist, registration_covariance(result))
 
@@ -389,7 +389,7 @@ def _transformed(wTl: FloatArray, lPs: FloatArray) -> FloatArray:
     return np.asarray(lPs @ wTl[:3, :3].T + wTl[:3, 3])
 
 
-def _orthonormal(matrix: FloatArray) -> FloatArray:
+def orthonormal(matrix: FloatArray) -> FloatArray:
     """The (4, 4) pose with its rotation made exact, so that products do not drift."""
     pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(matrix[:3, :3]), matrix[:3, 3])
     return np.asarray(pose.matrix())

@@ -30,6 +30,8 @@ MIN_NOISE_PX = 0.05
 _MIN_PARALLAX_RATIO = 4.0
 """The direction counts only where the parallax is this many times the noise; below, the five-point method's
 direction is noise."""
+_KNEE = 1.345
+"""Whitened residual beyond which Huber's weights fall."""
 _ITERATIONS = 8
 """Most Gauss-Newton steps of the refinement; it stops where a step is below 1e-5."""
 
@@ -44,7 +46,6 @@ class DirectionMotion:
         direction: (3,) unit vector from camera a to camera b, in camera a.
         covariance: (5, 5) of the essential matrix as gtsam has it: [rotation aRb * Exp(xi) in rad,
             direction in the basis of ``gtsam.Unit3(direction)`` in rad].
-        inliers: (n,) tracks that agree.
         noise_px: sigma of a track's coordinate [px].
         ok: whether the direction means anything; where False its sigma is pi, and only the
             rotation (ok or not, see its covariance) can be used.
@@ -54,7 +55,6 @@ class DirectionMotion:
     turn: gtsam.Rot3
     direction: FloatArray
     covariance: FloatArray
-    inliers: BoolArray
     noise_px: float
     ok: bool
 
@@ -67,7 +67,7 @@ def relative_pose(tracks: Tracks, camera: PinholeCamera) -> DirectionMotion:
     the noise only a rotation is estimated: the five-point direction would be noise.
     """
     if len(tracks) < _MIN_TRACKS:
-        return _unknown(len(tracks))
+        return _unknown()
     fa, fb = rays(tracks.uv_a, camera), rays(tracks.uv_b, camera)
     # 1. Rotation alone, and what it leaves unexplained.
     rotation, left = _rotation_only(fa, fb, camera)
@@ -83,7 +83,7 @@ def relative_pose(tracks: Tracks, camera: PinholeCamera) -> DirectionMotion:
     if size > _MIN_PARALLAX_RATIO * np.sqrt(2.0) * best.noise_px:
         direction = best.direction * _side(best.rotation, best.direction, fa[best.inliers], fb[best.inliers])
         found, turn = gtsam.Rot3(best.rotation), gtsam.Rot3(rotation)
-        return DirectionMotion(found, turn, direction, best.covariance, best.inliers, best.noise_px, True)
+        return DirectionMotion(found, turn, direction, best.covariance, best.noise_px, True)
     return _turn(rotation, left, fb, camera)
 
 
@@ -96,7 +96,7 @@ def _turn(aRb: FloatArray, left: FloatArray, fb: FloatArray, camera: PinholeCame
         J = _rotation_jacobian(np.eye(3), fb[inliers], camera)
         covariance[:3, :3] = noise**2 * np.linalg.inv(J.T @ J)
     forward = np.array([0.0, 0.0, 1.0])
-    return DirectionMotion(gtsam.Rot3(aRb), gtsam.Rot3(aRb), forward, covariance, inliers, noise, False)
+    return DirectionMotion(gtsam.Rot3(aRb), gtsam.Rot3(aRb), forward, covariance, noise, False)
 
 
 def rays(uvs: FloatArray, camera: PinholeCamera) -> FloatArray:
@@ -106,7 +106,7 @@ def rays(uvs: FloatArray, camera: PinholeCamera) -> FloatArray:
     )
 
 
-def huber_weights(size: FloatArray, knee: float = 1.345, gate: float = 4.0) -> FloatArray:
+def huber_weights(size: FloatArray, knee: float = _KNEE, gate: float = 4.0) -> FloatArray:
     """Weight of whitened residuals of given size; 0 beyond the gate, where nothing is noise."""
     size = np.abs(size)
     weights = np.minimum(1.0, knee / np.maximum(size, 1e-12))
@@ -271,10 +271,10 @@ def _inverse_of_genuine(information: FloatArray, spurious: FloatArray) -> FloatA
     return np.asarray((root / np.maximum(values, 0.02)) @ root.T)
 
 
-def _cost_of_weights(whitened: FloatArray, knee: float = 1.345) -> float:
+def _cost_of_weights(whitened: FloatArray) -> float:
     """E[psi^2] / E[psi']^2: what the robust weights cost in variance (Huber 1981, eq. 7.6.7)."""
-    psi = np.clip(whitened, -knee, knee)
-    inside = float(np.mean(np.abs(whitened) < knee))
+    psi = np.clip(whitened, -_KNEE, _KNEE)
+    inside = float(np.mean(np.abs(whitened) < _KNEE))
     return float(np.mean(psi**2)) / max(inside, 0.1) ** 2
 
 
@@ -321,8 +321,8 @@ def _rotation_jacobian(aRb: FloatArray, fa: FloatArray, camera: PinholeCamera) -
     return np.asarray(-J.reshape(-1, 3))
 
 
-def _unknown(n: int) -> DirectionMotion:
+def _unknown() -> DirectionMotion:
     """Nothing known: too few tracks."""
     covariance = np.diag([1.0] * 3 + [np.pi**2] * 2)
     rotation, forward = gtsam.Rot3(), np.array([0.0, 0.0, 1.0])
-    return DirectionMotion(rotation, rotation, forward, covariance, np.zeros(n, np.bool_), 1.0, False)
+    return DirectionMotion(rotation, rotation, forward, covariance, 1.0, False)

@@ -39,20 +39,8 @@ _DIFFUSE = (1e8, 1e6)
 """Variances of twist and acceleration before the first motion, in units of the noise."""
 
 
-def smoothed(motions: Sequence[RelativeMotion]) -> list[RelativeMotion]:
-    """The motions without noise that a vehicle cannot follow; standstill and failures stay as they are.
-
-    Args:
-        motions: consecutive, stamps rising; exactly the identity at standstill.
-
-    Returns:
-        As many motions; the covariance of a smoothed one is diagonal, and nearly common to its neighbours.
-    """
-    return MotionSmoother().smoothed(motions)
-
-
 class MotionSmoother:
-    """:func:`smoothed` for motions of which some are new in each call.
+    """Takes from motions the noise that a vehicle cannot follow; some of them may be new in each call.
 
     What is known of a motion hardly changes once a ``reach`` of others has followed; then it stays as it is.
     """
@@ -63,7 +51,16 @@ class MotionSmoother:
         self._runs: list[_Run] = []
 
     def smoothed(self, motions: Sequence[RelativeMotion]) -> list[RelativeMotion]:
-        """As :func:`smoothed`; a motion that an earlier call had is known by being the same object."""
+        """The motions without that noise; standstill and failures stay as they are.
+
+        Args:
+            motions: consecutive, stamps rising; exactly the identity at standstill. One that an earlier call
+                had is known by being the same object.
+
+        Returns:
+            As many motions; the covariance of a smoothed one is diagonal, and nearly common to its
+            neighbours.
+        """
         result, runs = list(motions), []
         for start, end in _ranges(motions):
             run = self._continued(motions[start:end])

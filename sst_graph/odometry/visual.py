@@ -1,6 +1,6 @@
 """Visual odometry: FAST corners, Lucas-Kanade tracks, five points, metric by LiDAR depth.
 
-The expensive part, :func:`image_pairs`, depends on no calibration and is done once; the metric part,
+The expensive part, :func:`next_pair`, depends on no calibration and is done once; the metric part,
 :func:`metric_motions`, is cheap and repeated whenever extrinsic and time offset have moved.
 """
 
@@ -38,34 +38,18 @@ class ImagePair:
     direction: DirectionMotion
 
 
-class VisualOdometry:
-    """Camera motion, image by image; keeps the last image, its depth and the last motion."""
+def next_pair(
+    tracker: FeatureTracker, image: CameraImage, camera: PinholeCamera, interval_s: float
+) -> ImagePair | None:
+    """The last tracked image and this one; None for the first, and where it follows sooner than interval_s.
 
-    def __init__(self, camera: PinholeCamera) -> None:
-        self.camera = camera
-        self._tracker = FeatureTracker()
-        self._depth = np.zeros((0, 3))
-        self._last: RelativeMotion | None = None
-
-    def add(self, image: CameraImage, depth_points_c: FloatArray) -> RelativeMotion | None:
-        """Motion from the image before to this one; None for the first.
-
-        Args:
-            image: next image.
-            depth_points_c: (m, 3) LiDAR points in the camera at this image's instant [m];
-                they give the length of the *next* motion.
-
-        Raises:
-            DataError: the image is not later than the one before, or of another size.
-        """
-        tracks = self._tracker.add(image)
-        depth, self._depth = self._depth, depth_points_c
-        if tracks is None:
-            return None
-        pair = ImagePair(tracks, relative_pose(tracks, self.camera))
-        motion = metric_motion(tracks, pair.direction, depth, self.camera)
-        self._last = _predicted(motion, self._last)
-        return self._last
+    Raises:
+        DataError: the image is not later than the one before, or of another size.
+    """
+    if tracker.seconds_to(image) < interval_s:
+        return None
+    tracks = tracker.add(image)
+    return None if tracks is None else ImagePair(tracks, relative_pose(tracks, camera))
 
 
 def image_pairs(images: Iterable[CameraImage], camera: PinholeCamera) -> list[ImagePair]:
@@ -91,15 +75,6 @@ def metric_motions(
         motion = metric_motion(pair.tracks, pair.direction, depth, camera)
         motions.append(_predicted(motion, motions[-1] if motions else None))
     return motions
-
-
-def visual_odometry(
-    images: Iterable[CameraImage],
-    camera: PinholeCamera,
-    depth_provider: DepthProvider,
-) -> list[RelativeMotion]:
-    """Camera motions between consecutive images, :func:`image_pairs` and :func:`metric_motions` in one."""
-    return metric_motions(image_pairs(images, camera), camera, depth_provider)
 
 
 def _predicted(motion: RelativeMotion, last: RelativeMotion | None) -> RelativeMotion:

@@ -43,9 +43,7 @@ class Placements:
     after: Calibration
 
 
-def overlay(
-    drawn: DrawnFrame, placements: Placements, points: PointResiduals | None, edge_name: str = "contour"
-) -> str:
+def overlay(drawn: DrawnFrame, placements: Placements, points: PointResiduals | None, edge_name: str) -> str:
     """A picture with the cloud of one frame, for the page's script.
 
     Args:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.fit import Fit, Profile
-from sst_graph.inspect.inspection import HUMAN, NAMES, UNITS, Correlation, correlation_matrix
+from sst_graph.inspect.inspection import HUMAN, NAMES, UNITS, Correlation, correlation_matrix, sigma_ellipse
 from sst_graph.report.chart import Chart
 from sst_graph.report.html import figure, table, text
 from sst_graph.result import CalibrationResult
@@ -95,12 +95,10 @@ def _profile(profile: Profile, sigma: float) -> str:
 def ellipse_charts(result: CalibrationResult, pairs: Sequence[Correlation]) -> list[str]:
     """1 and 2 sigma of the pairs of unknowns that are correlated most."""
     covariance = result.covariance * np.outer(HUMAN, HUMAN)
-    circle = np.stack([np.cos(t := np.linspace(0.0, 2.0 * np.pi, 91)), np.sin(t)])
     found = []
     for pair in pairs[:_ELLIPSES]:
         i, j = pair.first, pair.second
-        values, vectors = np.linalg.eigh(covariance[np.ix_((i, j), (i, j))])
-        ellipse = vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * circle)
+        ellipse = sigma_ellipse(covariance[np.ix_((i, j), (i, j))], 91)
         reach = 2.2 * np.sqrt(covariance[[i, j], [i, j]])
         chart = Chart(
             (-reach[0], reach[0]),

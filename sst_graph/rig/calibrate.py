@@ -448,11 +448,11 @@ def _camera_result(
     weak = open_directions(covariance, static, cTl, config.observability)
     not_converged = bool(wrong) or own.status == "not_converged"
     status: Status = "not_converged" if not_converged else "unobservable" if weak else "ok"
-    gone = {f"{direction.sentence}: {direction.advice}" for direction in own.weak_directions}
+    gone = {direction.reason for direction in own.weak_directions}
     kept = tuple(reason for reason in own.reasons if reason not in gone)
     if not own.frames_used and status == "ok":
         kept = (_FROM_OTHERS, *kept)
-    sentences = tuple(f"{direction.sentence}: {direction.advice}" for direction in weak)
+    sentences = tuple(direction.reason for direction in weak)
     alone = {
         "T_camera_lidar": own.T_camera_lidar.matrix().tolist(),
         "time_offset_s": own.time_offset_s,

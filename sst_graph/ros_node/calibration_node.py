@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -29,8 +28,6 @@ from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.track_update import TrackUpdate
 from sst_graph.tracker.tracker import Tracker
 from sst_graph.types import CameraImage, Frame, SemanticClass
-
-_LOG = logging.getLogger(__name__)
 
 
 class CalibrationNode:
@@ -229,7 +226,7 @@ class CalibrationNode:
         if not self.lidar.frame:
             return None, 0.0, "no cloud yet"
         oTl, why = self._transforms.pose(self.camera.frame, self.lidar.frame)
-        return (None if oTl is None else gtsam.Pose3(geometry.cRo, np.zeros(3)) * oTl), 0.0, why
+        return (None if oTl is None else geometry.extrinsic(oTl)), 0.0, why
 
     def _use(self, one: Waiting, now_ns: int) -> TrackUpdate | None:
         """Decode a message and give it to the tracker; its update, or None where it cannot be decoded."""

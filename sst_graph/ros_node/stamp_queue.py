@@ -55,7 +55,7 @@ class StampQueue:
             self._waiting.pop(0)
             self.dropped += 1
 
-    def due(self, at_end: bool = False) -> list[Waiting]:
+    def due(self, at_end: bool) -> list[Waiting]:
         """Messages that have waited long enough by the newest stamp, or are too many; all ``at_end``."""
         due = 0
         if self._newest_ns is not None and self._waiting:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.classes import class_of_name, map_of_names
-from sst_graph.errors import DataError, MissingDependencyError
+from sst_graph.errors import DataError, MissingDependencyError, one_line
 from sst_graph.segmentation.label_numbers import LabelNumbers
 from sst_graph.segmentation.segmenter import ImageLabels
 from sst_graph.types import CameraImage, SemanticClass
@@ -44,7 +44,7 @@ class HuggingFaceSegmenter:
         except DataError:
             raise
         except Exception as error:  # of transformers, the hub, safetensors, torch
-            found = f"no model that loads ({_line(error)})"
+            found = f"no model that loads ({one_line(error):.200})"
             raise DataError(self._place, found, "a model of transformers for semantic segmentation") from None
         self.name = Path(str(model)).name
         self.numbers = self._numbers() if numbers is None else numbers
@@ -77,7 +77,7 @@ class HuggingFaceSegmenter:
         try:
             labels = self._labels(rgb)
         except Exception as error:
-            raise DataError(self._place, f"a failure on {place} ({_line(error)})", "labels") from None
+            raise DataError(self._place, f"a failure on {place} ({one_line(error):.200})", "labels") from None
         return ImageLabels(self.numbers.of_labels(labels, self._place))
 
     def _labels(self, rgb: NDArray[np.uint8]) -> NDArray[np.int64]:
@@ -128,7 +128,3 @@ def _modules(place: str) -> tuple[Any, Any]:
             "pip install 'sst-graph[hf]'"
         ) from None
     return transformers, torch
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__

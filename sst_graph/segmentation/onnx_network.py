@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.errors import DataError, MissingDependencyError, count_of
+from sst_graph.errors import DataError, MissingDependencyError, count_of, one_line
 from sst_graph.files.reading import FileKind, digest_of_file
 from sst_graph.segmentation.label_numbers import LabelNumbers
 
@@ -106,7 +106,7 @@ class OnnxNetwork:
         try:
             found = self._session.run(None, {self._input: np.ascontiguousarray(values, self.dtype)})
         except Exception as error:
-            raise DataError(self.path, f"a failure on {place} ({_line(error)})", "labels") from None
+            raise DataError(self.path, f"a failure on {place} ({one_line(error):.200})", "labels") from None
         outputs = dict(zip(self.outputs, (np.asarray(one) for one in found), strict=True))
         for name, array in outputs.items():
             if array.dtype.kind == "f" and not np.isfinite(array).all():
@@ -140,7 +140,7 @@ def _session(runtime: Any, path: Path, options: Any) -> Any:
         except Exception as error:  # its exceptions share no other base
             refusal = refusal or error
     assert refusal is not None
-    raise DataError(path, f"no network that loads ({_line(refusal)})", NETWORK.name) from None
+    raise DataError(path, f"no network that loads ({one_line(refusal):.200})", NETWORK.name) from None
 
 
 def _described(session: Any, path: Path) -> tuple[list[tuple[str, str, tuple[Any, ...]]], tuple[str, ...]]:
@@ -153,7 +153,7 @@ def _described(session: Any, path: Path) -> tuple[list[tuple[str, str, tuple[Any
         inputs = [(one.name, one.type, tuple(one.shape or ())) for one in session.get_inputs()]
         return inputs, tuple(one.name for one in session.get_outputs())
     except UnicodeDecodeError as error:
-        raise DataError(path, f"names that are no UTF-8 ({_line(error)})", NETWORK.name) from None
+        raise DataError(path, f"names that are no UTF-8 ({one_line(error):.200})", NETWORK.name) from None
 
 
 def _runtime(path: Path) -> Any:
@@ -180,7 +180,3 @@ def _escaped(name: str) -> str:
 
 def _shown(shape: tuple[int | None, ...]) -> str:
     return "x".join("any" if size is None else str(size) for size in shape) or "no dimensions"
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__

@@ -156,18 +156,17 @@ def grid_triangles(points: FloatArray) -> FloatArray:
     return triangles.reshape(-1, 3, 3)
 
 
-def loft_triangles(sections: FloatArray, caps: bool = True) -> FloatArray:
-    """Triangles of a tube through closed sections (s, k, 3), which turn counter-clockwise about the
+def loft_triangles(sections: FloatArray) -> FloatArray:
+    """Triangles of a tube with caps through closed sections (s, k, 3), which turn counter-clockwise about the
     direction in which the sections advance (y to z for +x). The sides come first: face (i, j) of
     the (s - 1, k) sides is triangle i k + j, and again after (s - 1) k."""
     closed = np.concatenate([sections, sections[:, :1]], axis=1)
     parts = [grid_triangles(closed)[:, ::-1]]
-    if caps:
-        for section, reverse in ((sections[0], True), (sections[-1], False)):
-            fan = np.empty((len(section), 3, 3))
-            fan[:, 0], fan[:, 1] = section.mean(axis=0), section
-            fan[:-1, 2], fan[-1, 2] = section[1:], section[0]
-            parts.append(fan[:, ::-1] if reverse else fan)
+    for section, reverse in ((sections[0], True), (sections[-1], False)):
+        fan = np.empty((len(section), 3, 3))
+        fan[:, 0], fan[:, 1] = section.mean(axis=0), section
+        fan[:-1, 2], fan[-1, 2] = section[1:], section[0]
+        parts.append(fan[:, ::-1] if reverse else fan)
     return np.concatenate(parts)
 
 
@@ -193,7 +192,7 @@ def cylinder_triangles(
     return loft_triangles(np.stack([start + radii[0] * circle, end + radii[1] * circle]))
 
 
-def blob_triangles(rng: np.random.Generator, radii: FloatArray, rough: float, rows: int = 7) -> FloatArray:
+def blob_triangles(rng: np.random.Generator, radii: FloatArray, rough: float, rows: int) -> FloatArray:
     """Triangles of a rough ellipsoid about the origin: radii (3,) [m], ``rough`` the relative bumps."""
     columns = 2 * rows - 3
     polar = np.pi * np.arange(rows) / (rows - 1)

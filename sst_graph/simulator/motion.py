@@ -33,14 +33,14 @@ class Path:
     yaw: FloatArray
     height: FloatArray
 
-    def at(self, s: FloatArray, left: FloatArray | float = 0.0) -> FloatArray:
+    def at(self, s: FloatArray, left: FloatArray | float) -> FloatArray:
         """(n, 3) points at arc lengths ``s`` (n,), ``left`` metres to the left, on the ground [m]."""
         yaw = self.yaw_at(s)
         x = np.interp(s, self.s, self.xy[:, 0]) - left * np.sin(yaw)
         y = np.interp(s, self.s, self.xy[:, 1]) + left * np.cos(yaw)
         return np.stack([x, y, np.interp(s, self.s, self.height)], axis=1)
 
-    def frame(self, s: float, left: float = 0.0) -> tuple[FloatArray, FloatArray]:
+    def frame(self, s: float, left: float) -> tuple[FloatArray, FloatArray]:
         """Rotation (3, 3) and position (3,) [m] of something that stands on the street and faces along it."""
         nearby = self.at(np.array([s - 1.5, s, s + 1.5]), 0.0)
         forward = nearby[2] - nearby[0]

@@ -9,13 +9,12 @@ import gtsam
 import numpy as np
 
 from sst_graph.errors import ConfigError
+from sst_graph.metrics import FORWARD_R_OPTICAL
 from sst_graph.simulator.drive import SimulatedDrive, mounting_error
 from sst_graph.types import GroundTruth
 
 STEREO_BASELINE_M = 0.5329697
 """KITTI's image_3 stands so far to the right of image_2 [m]."""
-_OPTICAL = gtsam.Rot3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
-"""Rotation of a camera that looks forward (x right, y down, z forward) in the LiDAR (x forward, z up)."""
 
 
 @dataclass(frozen=True)
@@ -33,23 +32,21 @@ class Mount:
     time_offset_s: float
 
 
-def beside(drive: SimulatedDrive, cTa: gtsam.Pose3, time_offset_s: float | None = None) -> Mount:
-    """A camera that stands to the drive's own exactly as the data say.
+def beside(drive: SimulatedDrive, cTa: gtsam.Pose3) -> Mount:
+    """A camera that stands to the drive's own exactly as the data say, with the same trigger.
 
     Args:
         cTa: pose of the drive's own camera in the further one.
-        time_offset_s: of its images; by default the same, as of cameras with one trigger [s].
     """
-    time_offset_s = drive.config.time_offset_s if time_offset_s is None else time_offset_s
-    return Mount(cTa * drive.nominal, cTa * drive.truth.cTl, time_offset_s)
+    return Mount(cTa * drive.nominal, cTa * drive.truth.cTl, drive.config.time_offset_s)
 
 
-def stereo_pose(baseline_m: float = STEREO_BASELINE_M) -> gtsam.Pose3:
+def stereo_pose() -> gtsam.Pose3:
     """Pose of the left camera in the right one."""
-    return gtsam.Pose3(gtsam.Rot3(), np.array([-baseline_m, 0.0, 0.0]))
+    return gtsam.Pose3(gtsam.Rot3(), np.array([-STEREO_BASELINE_M, 0.0, 0.0]))
 
 
-def surround(drive: SimulatedDrive, count: int = 6) -> dict[str, Mount]:
+def surround(drive: SimulatedDrive, count: int) -> dict[str, Mount]:
     """Cameras all around: at even steps of yaw from that of the drive's own, each nominal pose wrong by the
     configured error in its own way, with lever arms of 0.2 to 1 m and time offsets within 30 ms of the
     drive's."""
@@ -59,7 +56,7 @@ def surround(drive: SimulatedDrive, count: int = 6) -> dict[str, Mount]:
         yaw = 2.0 * np.pi * k / count
         arm = float(rng.uniform(0.2, 1.0))
         where = np.array([arm * np.cos(yaw), arm * np.sin(yaw), -float(rng.uniform(0.0, 0.3))])
-        nominal = gtsam.Pose3(gtsam.Rot3.Rz(yaw) * _OPTICAL, where).inverse()
+        nominal = gtsam.Pose3(gtsam.Rot3.Rz(yaw) * FORWARD_R_OPTICAL, where).inverse()
         time_offset_s = drive.config.time_offset_s + float(rng.uniform(-0.03, 0.03))
         mounts[f"camera_{k}"] = Mount(nominal, nominal * mounting_error(drive.config, rng), time_offset_s)
     return mounts

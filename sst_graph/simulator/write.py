@@ -66,9 +66,7 @@ def write_drive(
     return Path(path) / "sequences" / "00"
 
 
-def fill_drive(
-    drive: SimulatedDrive, root: Path, progress: Progress | None = None, stereo: bool = False
-) -> None:
+def fill_drive(drive: SimulatedDrive, root: Path, progress: Progress | None, stereo: bool = False) -> None:
     """Write the drive's files into ``root``/sequences/00, which must not be there; :func:`write_drive`.
 
     Raises:

@@ -37,7 +37,7 @@ from sst_graph.factors.arguments import (
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.factors.motion import CameraTwist
 from sst_graph.factors.robust import RobustKernel
-from sst_graph.features.lidar_edges import Boundaries
+from sst_graph.features.lidar_edges import Boundaries, with_points
 from sst_graph.objects.occupancy import ObjectName
 from sst_graph.objects.velocity import velocities_of_points
 from sst_graph.types import CameraImage, Scan, SemanticClass
@@ -306,7 +306,7 @@ def _unlabelled(
     for c, points in found.items():
         distances, _ = tree.query(points.lPs, distance_upper_bound=_LABELLED_M)
         kept[c] = points.take(np.flatnonzero(np.isinf(distances)))
-    return {c: points for c, points in kept.items() if len(points)}
+    return with_points(kept)
 
 
 def _carried(

@@ -10,6 +10,7 @@ import gtsam
 from sst_graph.errors import count_of
 from sst_graph.factors import FactorError, recipe_of
 from sst_graph.factors.arguments import checked_type
+from sst_graph.factors.custom.variables import factors_of
 from sst_graph.factors.pose_alignment import NAME
 from sst_graph.slam.alignment_keys import AlignmentKeys
 from sst_graph.slam.alignment_term import AlignmentTerm
@@ -55,8 +56,7 @@ def expect_factors_of(
         FactorError: one of these is missing or there twice, or there is another.
     """
     own, variables = {id(each) for each in factors}, set(keys.variables)
-    every = [graph.at(i) for i in range(graph.size()) if graph.exists(i)]
-    held = [each for each in every if isinstance(each, gtsam.CustomFactor)]
+    held = [each for each in factors_of(graph) if isinstance(each, gtsam.CustomFactor)]
     found = [id(each) for each in held if id(each) in own]
     others = [each for each in held if id(each) not in own and variables & set(each.keys())]
     alignments = [each for each in others if (recipe := recipe_of(each)) and recipe.name == NAME]

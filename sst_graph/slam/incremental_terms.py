@@ -20,7 +20,7 @@ from sst_graph.config import expect_settings
 from sst_graph.errors import EstimationError
 from sst_graph.factors import FactorError
 from sst_graph.factors.arguments import checked_count, checked_number, checked_type
-from sst_graph.factors.custom.variables import checked_key, expect_kinds, key_name
+from sst_graph.factors.custom.variables import checked_key, expect_kinds, factors_of, key_name
 from sst_graph.slam.alignment_keys import COLUMNS, AlignmentKeys
 from sst_graph.slam.alignment_term import AlignmentTerm, TermMatches, TermState
 from sst_graph.slam.checked_terms import checked_terms, expect_factors_of
@@ -346,7 +346,7 @@ class IncrementalTerms:
             if isam.valueExists(key):
                 expected = "new variables only"
                 raise FactorError(f"values of {where}", f"{key_name(key)}, which is there already", expected)
-        factors = [graph.at(i) for i in range(graph.size()) if graph.exists(i)]
+        factors = factors_of(graph)
         for key in sorted({*self._keys.lasting, *(int(key) for one in factors for key in list(one.keys()))}):
             if key not in new and not isam.valueExists(key):
                 expected = "a value for each key of the graph, of extrinsic, offset and biases"

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sst_graph.drive.preparation import ScanFeatures
 from sst_graph.errors import DataError, count_of
 from sst_graph.factors.arguments import checked_gtsam, checked_type
+from sst_graph.features.lidar_edges import with_points
 from sst_graph.objects.dynamic_objects import DynamicObjectTest
 from sst_graph.objects.occupancy import ObjectName
 from sst_graph.objects.tracks import ObjectTracker
@@ -79,4 +80,4 @@ def _without(scan: ScanFeatures, names: set[ObjectName]) -> ScanFeatures:
         c: points.take(np.flatnonzero(~np.isin(points.objects, [n for of, n in names if of == c])))
         for c, points in scan.boundaries.items()
     }
-    return replace(scan, boundaries={c: points for c, points in boundaries.items() if len(points)})
+    return replace(scan, boundaries=with_points(boundaries))

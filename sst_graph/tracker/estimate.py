@@ -19,7 +19,7 @@ from sst_graph.errors import EstimationError
 from sst_graph.odometry.sweep import SweepDecision
 from sst_graph.tracker.assumption_tests import AssumptionTests
 from sst_graph.tracker.by_edges.kinds import by_edges
-from sst_graph.tracker.by_edges.review import softness
+from sst_graph.tracker.by_edges.review import variance_ratio
 from sst_graph.tracker.by_edges.reviews import EdgeReviews
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.history import History, HistoryEntry
@@ -185,14 +185,14 @@ class OnlineEstimate:
         return considered + self.edges.covariance(self.smoother, self.uncertainty)
 
     @property
-    def softness(self) -> float:
-        """Of the matches (:func:`~sst_graph.tracker.by_edges.review.softness`)."""
-        return 1.0 if self.edges is None else softness(self.edges.found, self.covariance)
+    def variance_ratio(self) -> float:
+        """Of the matches (:func:`~sst_graph.tracker.by_edges.review.variance_ratio`)."""
+        return 1.0 if self.edges is None else variance_ratio(self.edges.found, self.covariance)
 
     @property
-    def doubts(self) -> tuple[str, ...]:
+    def reasons(self) -> tuple[str, ...]:
         """Why the estimate may be wrong altogether."""
-        return () if self.edges is None else self.edges.doubts(self.uncertainty)
+        return () if self.edges is None else self.edges.reasons_for(self.uncertainty)
 
     def by_sweep(self) -> SweepEffect:
         """The effect of a sweep that the scans leave undecided.

@@ -14,8 +14,7 @@ from sst_graph.drive.stamp_intervals import Jump, StampMonitor
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.lidar import LidarOdometry
-from sst_graph.odometry.relative import relative_pose
-from sst_graph.odometry.visual import ImagePair
+from sst_graph.odometry.visual import ImagePair, next_pair
 from sst_graph.tracker.admission import StampOrder, check_lateness
 from sst_graph.tracker.by_edges.kinds import by_edges
 from sst_graph.tracker.config import TrackerConfig
@@ -152,10 +151,7 @@ class SensorInputs:
         if not by_edges(self.config.calibration.classes) or estimate.exists:
             self.image_features = FeatureTracker()
             return None
-        if self.image_features.seconds_to(image) < TRACK_INTERVAL_S:
-            return None
-        tracks = self.image_features.add(image)
-        return None if tracks is None else ImagePair(tracks, relative_pose(tracks, self.camera))
+        return next_pair(self.image_features, image, self.camera, TRACK_INTERVAL_S)
 
     def failed(self, why: str) -> bool:
         """Note why a scan or an image could not be used; whether that has gone on for too long."""

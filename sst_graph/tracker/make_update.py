@@ -37,7 +37,7 @@ def make_update(
         sweep = estimate.by_sweep().sentence
         unconfirmed = changes.start_unconfirmed or confirmation.too_old or sweep
         status = "unobservable" if weak else "unconfirmed" if unconfirmed else "ok"
-        contradictions = (*contradictions, *estimate.doubts)
+        contradictions = (*contradictions, *estimate.reasons)
         status = "contradicted" if contradictions else status
     return TrackUpdate(
         stamp_ns=stamp_ns,

@@ -11,7 +11,7 @@ from sst_graph.batch.method_estimate import package_versions
 from sst_graph.config import to_dict
 from sst_graph.factors.arguments import checked_type
 from sst_graph.inspect.gained import KEY, to_document
-from sst_graph.result import UNNAMED_CAMERA, CalibrationResult, FrameId, Status
+from sst_graph.result import CalibrationResult, FrameId, Status
 from sst_graph.tracker.make_update import current_update
 from sst_graph.tracker.track_update import TrackUpdate
 
@@ -20,9 +20,7 @@ if TYPE_CHECKING:
     from sst_graph.tracker.tracker import Tracker
 
 
-def tracker_result(
-    tracker: Tracker, drive: str = "stream", camera_name: str = UNNAMED_CAMERA
-) -> CalibrationResult:
+def tracker_result(tracker: Tracker, drive: str, camera_name: str) -> CalibrationResult:
     """The present estimate as a result; frames used are those of the window.
 
     Raises:

@@ -144,7 +144,7 @@ class Tracker:
                     return self._restart(change, checked.stamp_ns)
                 # 7. Add the matches to the graph, and estimate.
                 self.estimate.update(matches)
-                self.monitor.changes.statistic.softness = self.estimate.softness
+                self.monitor.changes.statistic.variance_ratio = self.estimate.variance_ratio
                 # 8. Check the start against later frames; adopt the estimate where held-out frames agree.
                 return self._review(matches, checked.stamp_ns, chi2)
         except Exception as error:
@@ -167,7 +167,7 @@ class Tracker:
         checked_count("max_iterations", max_iterations)
         at_end = not self.estimate.exists and self._finish_start()
         converged = self.estimate.optimize(max_iterations)
-        self.monitor.changes.statistic.softness = self.estimate.softness
+        self.monitor.changes.statistic.variance_ratio = self.estimate.variance_ratio
         if converged is not None and (at_end or self.estimate.edges is not None):
             self.monitor.check_start_at_end(self.estimate)
         return dataclasses.replace(current_update(self, self.last_update), converged=converged)
@@ -284,7 +284,7 @@ class Tracker:
         """Go on from a first estimate, if the frames that it is made of agree with it."""
         smoother, window = initialization.smoother, self.inputs.window
         estimate = ComparedEstimate(smoother.point, initialization.uncertainty.joint, smoother.model)
-        self.monitor.changes.statistic.softness = initialization.softness
+        self.monitor.changes.statistic.variance_ratio = initialization.variance_ratio
         why = ""
         if initialization.first.reviewed:
             why = self.monitor.changes.check_start(list(smoother.entries), estimate)

@@ -141,10 +141,10 @@ class Recording:
         self._log(f"{IMAGE}/points_by_class", rr.Points2D(view.uvs, class_ids=classes, radii=0.8))
         self._log_matches(view.matches)
 
-    def update(self, update: TrackUpdate, stamp_ns: int | None = None) -> None:
+    def update(self, update: TrackUpdate) -> None:
         """The tracker's estimate after a frame: deviations from the first one, with 2 sigma; status."""
         if update.frame is not None:
-            self._at(update.frame, update.stamp_ns if stamp_ns is None else stamp_ns)
+            self._at(update.frame, update.stamp_ns)
         if self._reference is None:
             self._reference = Calibration(update.T_camera_lidar, update.time_offset_s)
         if update.covariance is not None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import count_of
-from sst_graph.inspect.inspection import HUMAN, NAMES, UNITS, Inspection
+from sst_graph.inspect.inspection import HUMAN, NAMES, UNITS, Inspection, sigma_ellipse
 from sst_graph.inspect.planning import AT_REST_MPS, Plan
 from sst_graph.viz.graph_plot import draw_graph
 from sst_graph.viz.matplotlib_figure import figure_class
@@ -55,12 +55,9 @@ def inspection_plots(inspection: Inspection) -> dict[str, Any]:
 def draw_ellipses(figure: Any, inspection: Inspection) -> Any:
     """1, 2 and 3 sigma of pairs of unknowns around the estimate, along the LiDAR's axes."""
     covariance = inspection.result.covariance * np.outer(HUMAN, HUMAN)
-    circle = np.stack([np.cos(t := np.linspace(0.0, 2.0 * np.pi, 181)), np.sin(t)])
     axes = figure.subplots(3, 3)
     for ax, (i, j) in zip(axes.flat, (pair for row in _PAIRS for pair in row), strict=True):
-        block = covariance[np.ix_((i, j), (i, j))]
-        values, vectors = np.linalg.eigh(block)
-        ellipse = vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * circle)
+        ellipse = sigma_ellipse(covariance[np.ix_((i, j), (i, j))], 181)
         for k, alpha in ((3, 0.12), (2, 0.25), (1, 0.55)):
             ax.fill(*(k * ellipse), color="tab:blue", alpha=alpha, lw=0.0)
         ax.plot(*(3.0 * ellipse), color="tab:blue", lw=0.8)

@@ -103,25 +103,6 @@ def draw_overlay(
     return np.vstack([_strip(picture.shape[1], words), picture])
 
 
-def before_after(
-    frame: Frame,
-    camera: PinholeCamera,
-    before: Placement,
-    after: Placement,
-    c_twist: FloatArray | None = None,
-) -> Picture:
-    """:func:`draw_overlay` of two placements of the same frame, one above the other.
-
-    Raises:
-        DataError: as :func:`draw_overlay`.
-    """
-    above, below = (
-        draw_overlay(frame, camera, place.cTl, place.time_offset_s, c_twist, place.caption)
-        for place in (before, after)
-    )
-    return stacked(above, below)
-
-
 def stacked(above: Picture, below: Picture) -> Picture:
     """Two pictures of the same width, one above the other."""
     return np.vstack([above, np.full((6, above.shape[1], 3), 255, np.uint8), below])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sst_graph.data import open_source
 from sst_graph.odometry.lidar import lidar_odometry
 from sst_graph.odometry.standstill import standstill_frames
-from sst_graph.odometry.visual import visual_odometry
+from sst_graph.odometry.visual import image_pairs, metric_motions
 from sst_graph.types import CameraImage, RelativeMotion, Scan, Source
 
 DRIVES = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -48,7 +48,7 @@ def camera_motions(source: Source, count: int | None = None) -> list[RelativeMot
         assert frame.scan is not None
         images.append(frame.image)
         clouds.append(nominal.transformFrom(frame.scan.points.astype(np.float64).T).T)
-    return visual_odometry(images, source.camera, clouds.__getitem__)
+    return metric_motions(image_pairs(images, source.camera), source.camera, clouds.__getitem__)
 
 
 def scans_of(source: Source) -> list[Scan]:

@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from sst_graph.odometry.smoothing import MotionSmoother, smoothed
+from sst_graph.odometry.smoothing import MotionSmoother
 from sst_graph.types import RelativeMotion
 
 PERIOD_S = 0.1
@@ -42,7 +42,7 @@ def test_smoothing_removes_noise_as_its_sigma_claims(scale: float) -> None:
     before, after, squares = [], [], []
     for seed in range(8):
         motions, truth = drive(60, seed, scale)
-        found, sigmas = of(smoothed(motions))
+        found, sigmas = of(MotionSmoother().smoothed(motions))
         before.append(of(motions)[0] - truth)
         after.append(found - truth)
         squares.append(((found - truth) / sigmas) ** 2)
@@ -63,7 +63,7 @@ def test_a_rough_motion_errs_by_its_noise_at_most() -> None:
     for motion, speed in zip(motions, speeds, strict=True):
         step = gtsam.Pose3.Expmap(np.array([0.0, 0.0, 0.0, 0.0, 0.0, speed * PERIOD_S]))
         rough.append(RelativeMotion(motion.from_ns, motion.to_ns, step, motion.covariance))
-    error = of(smoothed(rough))[0][:, 5] - speeds
+    error = of(MotionSmoother().smoothed(rough))[0][:, 5] - speeds
     assert np.sqrt(np.mean(error**2)) < SIGMAS[5] / PERIOD_S
 
 
@@ -74,9 +74,9 @@ def test_standstill_failures_and_short_runs_stay() -> None:
         motions[11].from_ns, motions[11].to_ns, motions[11].aTb, motions[11].covariance, ok=False
     )
     given = [*motions[:4], still, *motions[5:11], failed]
-    found = smoothed(given)
+    found = MotionSmoother().smoothed(given)
     assert [a is b for a, b in zip(found, given, strict=True)] == [True] * 5 + [False] * 6 + [True]
-    assert smoothed([]) == []
+    assert MotionSmoother().smoothed([]) == []
 
 
 def test_uneven_intervals() -> None:
@@ -89,7 +89,7 @@ def test_uneven_intervals() -> None:
         )
         for a, b, p, q in zip(stamps, stamps[1:], way, way[1:], strict=False)
     ]
-    np.testing.assert_allclose(of(smoothed(motions))[0], of(motions)[0], atol=1e-4)
+    np.testing.assert_allclose(of(MotionSmoother().smoothed(motions))[0], of(motions)[0], atol=1e-4)
 
 
 def test_motion_by_motion() -> None:
@@ -98,7 +98,7 @@ def test_motion_by_motion() -> None:
     smoother = MotionSmoother(reach=25)
     for k in range(5, 61):
         window = smoother.smoothed(motions[max(0, k - 40) : k])
-    expected, sigmas = of(smoothed(motions)[-40:])
+    expected, sigmas = of(MotionSmoother().smoothed(motions)[-40:])
     assert len(window) == 40
     assert np.abs((of(window)[0] - expected) / sigmas).max() < 1.5
     # The latest, whose future no one knows, are the same to the digit.
@@ -121,4 +121,6 @@ def test_a_motion_that_later_counts_as_standstill() -> None:
     smoother = MotionSmoother(reach=25)
     smoother.smoothed(motions[:17])
     found = smoother.smoothed([*motions[:15], *rests])
-    np.testing.assert_allclose(of(found)[0], of(smoothed([*motions[:15], *rests]))[0], atol=1e-9)
+    np.testing.assert_allclose(
+        of(found)[0], of(MotionSmoother().smoothed([*motions[:15], *rests]))[0], atol=1e-9
+    )

@@ -17,7 +17,7 @@ from sst_graph.odometry.features import FeatureTracker, Tracks, detect_corners
 from sst_graph.odometry.metric import TrackErrors, metric_motion, motion_from_depths
 from sst_graph.odometry.relative import rays, relative_pose
 from sst_graph.odometry.starts import consensus_translation
-from sst_graph.odometry.visual import VisualOdometry, image_pairs, metric_motions, visual_odometry
+from sst_graph.odometry.visual import image_pairs, metric_motions
 from sst_graph.types import CameraImage, SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -297,23 +297,17 @@ def test_images_out_of_order_or_of_another_size_are_refused() -> None:
         tracked(as_image(gray, 0), as_image(gray[:100], 100))
 
 
-def test_a_wall_seen_twice_gives_metric_motion_frame_by_frame_and_at_once() -> None:
+def test_a_wall_seen_from_three_places_gives_metric_motion() -> None:
     # A camera moves 0.3 m to the right before a wall 6 m away: the picture moves left by f * 0.3 / 6.
     camera = PinholeCamera(200.0, 200.0, 160.0, 100.0, 320, 200)
     gray = textured()
     images = [as_image(shifted(gray, -10.0 * k, 0.0), 100_000_000 * k) for k in range(3)]
     us, vs = np.meshgrid(np.arange(0.0, 320.0, 4.0), np.arange(0.0, 200.0, 6.0))
     wall = rays(np.column_stack([us.ravel(), vs.ravel()]), camera) * 6.0
-    together = visual_odometry(images, camera, lambda _: wall)
+    together = metric_motions(image_pairs(images, camera), camera, lambda _: wall)
     assert [motion.ok for motion in together] == [True, True]
     for motion in together:
         np.testing.assert_allclose(motion.aTb.translation(), [0.3, 0.0, 0.0], atol=0.01)
-    online = VisualOdometry(camera)
-    answers = [online.add(image, wall) for image in images]
-    assert answers[0] is None
-    for one, other in zip(answers[1:], together, strict=True):
-        assert one is not None
-        assert one.aTb.equals(other.aTb, 1e-12)
 
 
 def test_refreshed_depth_scales_the_motion() -> None:

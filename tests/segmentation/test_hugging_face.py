@@ -11,6 +11,7 @@ import pytest
 from sst_graph.classes import class_map
 from sst_graph.errors import DataError
 from sst_graph.segmentation import open_image_segmenter, with_labels
+from sst_graph.segmentation.label_numbers import LabelNumbers
 from sst_graph.segmentation.segmenter import ImageSegmenter
 from sst_graph.types import CameraImage, SemanticClass
 
@@ -71,7 +72,7 @@ def test_labels_are_those_of_the_model(folder: Path) -> None:
     numbers = by_hand(folder)
     assert len(np.unique(numbers)) > 1
     assert (found.mask == np.vectorize(lambda k: int(CITYSCAPES.classes[k]))(numbers)).all()
-    assert segmenter.known == CITYSCAPES.known
+    assert segmenter.known == LabelNumbers.of(CITYSCAPES).known
     assert segmenter.name == "segformer"
 
 

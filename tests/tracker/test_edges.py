@@ -25,7 +25,7 @@ from sst_graph.graph.state import State
 from sst_graph.metrics import calibration_errors
 from sst_graph.result import CalibrationResult, read_result
 from sst_graph.tracker import inputs
-from sst_graph.tracker.by_edges.review import EdgeReview, softness
+from sst_graph.tracker.by_edges.review import EdgeReview, variance_ratio
 from sst_graph.tracker.estimate import OnlineEstimate
 from sst_graph.tracker.start.first_estimate import FirstEstimate
 from sst_graph.tracker.start.initializer import InitialGraph
@@ -203,8 +203,8 @@ def test_errors_of_edges_as_columns() -> None:
 
 
 def test_softness() -> None:
-    assert softness(EdgeReview(), np.eye(9)) == 1.0
-    assert softness(EdgeReview(spread=3.0 * np.eye(7)), np.eye(9)) == pytest.approx(4.0)
+    assert variance_ratio(EdgeReview(), np.eye(9)) == 1.0
+    assert variance_ratio(EdgeReview(spread=3.0 * np.eye(7)), np.eye(9)) == pytest.approx(4.0)
 
 
 def test_a_doubt_is_a_status() -> None:
@@ -212,7 +212,7 @@ def test_a_doubt_is_a_status() -> None:
     edges = tracker.estimate.edges
     assert edges is not None
     edges.reasons = ("the pose may be wrong altogether",)
-    assert tracker.estimate.doubts == ("the pose may be wrong altogether",)
+    assert tracker.estimate.reasons == ("the pose may be wrong altogether",)
     result = tracker.result()
     assert result.status == "not_converged" and "the pose may be wrong altogether" in result.reasons[0]
 

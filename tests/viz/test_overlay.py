@@ -11,7 +11,7 @@ import pytest
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.types import CameraImage, Frame, Scan, SemanticClass
-from sst_graph.viz import Placement, before_after, draw_overlay
+from sst_graph.viz import draw_overlay
 from sst_graph.viz.overlay import CONTOUR, IN_MASK, MIN_WIDTH_PX, NOT_ASKED, OUT_OF_MASK
 
 CAMERA = PinholeCamera(500.0, 500.0, 400.0, 100.0, 800, 200)
@@ -102,15 +102,6 @@ def test_the_image_stamp_counts() -> None:
     later = replace(frame, image=replace(frame.image, stamp_ns=10**9 + 2 * 10**8))
     picture = draw_overlay(later, CAMERA, WHERE, 0.0, np.array([0, 0, 0, 0, 0, 10.0]))
     assert (410, 100) in _pixels_of(picture, IN_MASK)
-
-
-def test_before_stands_above_after() -> None:
-    frame = _frame([[0, 0, 10]], [SemanticClass.VEHICLE])
-    aside = gtsam.Pose3(gtsam.Rot3(), [2.0, 0.0, 0.0])
-    picture = before_after(frame, CAMERA, Placement(aside, 0.0, "before"), Placement(WHERE, 0.0, "after"))
-    rows_red = np.argwhere((picture == OUT_OF_MASK).all(axis=2)[:, 500])[:, 0]
-    rows_green = np.argwhere((picture == IN_MASK).all(axis=2)[:, 400])[:, 0]
-    assert rows_red.max() < len(picture) / 2 < rows_green.max()
 
 
 def test_small_pictures_are_enlarged() -> None:

@@ -13,6 +13,7 @@ from sst_graph.batch.by_edges.label_parts import labelled_stamps
 from sst_graph.batch.config import CalibrationConfig, Method
 from sst_graph.data.frame_parts import RecentReader, image_positions, scan_positions
 from sst_graph.drive.preparation import Drive
+from sst_graph.quality.fit_of_solution import has_edges
 from sst_graph.sampling import evenly_spread
 from sst_graph.types import CameraImage, SemanticClass, Source
 
@@ -63,8 +64,7 @@ def with_method_of(config: CalibrationConfig, drives: Sequence[Drive]) -> Calibr
     """The same, by what drives were prepared for."""
     if config.method != "auto":
         return config
-    by_edges = any(SemanticClass.OBJECT in image.contours for drive in drives for image in drive.images)
-    if not by_edges:
+    if not has_edges(drives):
         return replace(config, method="joint")
     by_labels = any(all(labelled_stamps(drive)) for drive in drives)
     return replace(config, method="both" if by_labels else "edges")

@@ -49,8 +49,6 @@ one rig differ to the left; that of the time offset for the 7 and 10 ms that the
 2.6 and 4.5 ms with 2 ms here. No part of the model explains either."""
 SAMPLES = 16
 """Half-samples: the order of a Hadamard matrix."""
-_PAIRS = SAMPLES - 1
-"""Pairs of groups of objects, of which each half-sample has one group: each column but the constant one."""
 _POINTS_A_SCAN = 500
 """Most boundary points of a scan before half of the objects are taken: each edge keeps some."""
 _STEP_SIGMAS = 0.5
@@ -77,7 +75,7 @@ class EdgesCovariance:
             :func:`~sst_graph.batch.assumption_tests.assumption_report`.
         estimated: value and deviation of the parameters that are unknowns of the estimate, by name,
             JSON-able.
-        reasons: to doubt it.
+        reasons: why it may be too small.
         shared: what of it the other cameras on this LiDAR have, too.
     """
 
@@ -150,13 +148,13 @@ def few_edges(steps: FloatArray, outlines: FloatArray | None) -> tuple[str, ...]
         steps: of the half-samples.
         outlines: step without upper edges that may be no outline, or None.
     """
-    doubts = {FEW_OBJECTS: with_estimate(steps).sum() < FEWEST, FEW_OUTLINES: outlines is None}
-    return tuple(reason for reason, holds in doubts.items() if holds)
+    holding = {FEW_OBJECTS: with_estimate(steps).sum() < FEWEST, FEW_OUTLINES: outlines is None}
+    return tuple(reason for reason, holds in holding.items() if holds)
 
 
 def half_samples() -> BoolArray:
-    """(SAMPLES, 2 _PAIRS) which groups of objects each half-sample has: one of each pair, all pairs of groups
-    equally often together."""
+    """(SAMPLES, 2 (SAMPLES - 1)) which groups of objects each half-sample has: one of each pair, all pairs of
+    groups equally often together."""
     first = hadamard(SAMPLES)[:, 1:] > 0
     return np.stack([first, ~first], axis=2).reshape(SAMPLES, -1)
 

@@ -31,7 +31,6 @@ class Fused:
         state: its mean.
         covariance: (7, 7) larger where the two differ by more than theirs allow.
         by_sweeps: (7, 7) part of it by sweeps that the scans leave undecided.
-        gain: (7, 7) how the mean follows the second of the two.
         step: (7,) from the first to the second.
         chi2: of 7, of that step under the sum of the covariances.
     """
@@ -39,7 +38,6 @@ class Fused:
     state: State
     covariance: FloatArray
     by_sweeps: FloatArray
-    gain: FloatArray
     step: FloatArray
     chi2: float
 
@@ -61,7 +59,7 @@ class Fused:
         covariance += by_sweeps
         if chi2 > UNLIKELY_CHI2:
             covariance *= chi2 / 7.0
-        return cls(a.moved(moved), 0.5 * (covariance + covariance.T), 2.0 * by_sweeps, gain, step, chi2)
+        return cls(a.moved(moved), 0.5 * (covariance + covariance.T), 2.0 * by_sweeps, step, chi2)
 
 
 def state_of(estimate: MethodEstimate) -> State:

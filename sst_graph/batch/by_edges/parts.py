@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.drive.preparation import Drive, ScanFeatures
-from sst_graph.features.lidar_edges import Edge
+from sst_graph.features.lidar_edges import Edge, with_points
 from sst_graph.objects.tracks import ObjectId, numbers_in, of_each
 from sst_graph.types import SemanticClass
 
@@ -35,10 +35,8 @@ def with_objects(drive: Drive, tracks: Mapping[ObjectId, int], kept: NDArray[np.
         boundaries = {}
         for c, points in scan.boundaries.items():
             numbers = {n: tracks[position, c, n] for n in numbers_in(points.objects)}
-            chosen = points.take(np.flatnonzero(kept[of_each(points.objects, numbers) % len(kept)]))
-            if len(chosen):
-                boundaries[c] = chosen
-        scans.append(replace(scan, boundaries=boundaries))
+            boundaries[c] = points.take(np.flatnonzero(kept[of_each(points.objects, numbers) % len(kept)]))
+        scans.append(replace(scan, boundaries=with_points(boundaries)))
     return replace(drive, scans=tuple(scans))
 
 
@@ -47,5 +45,5 @@ def without_kind(drive: Drive, kind: Edge) -> Drive:
     scans = []
     for scan in drive.scans:
         kept = {c: points.take(np.flatnonzero(points.edges != kind)) for c, points in scan.boundaries.items()}
-        scans.append(replace(scan, boundaries={c: points for c, points in kept.items() if len(points)}))
+        scans.append(replace(scan, boundaries=with_points(kept)))
     return replace(drive, scans=tuple(scans))

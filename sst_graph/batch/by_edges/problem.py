@@ -76,7 +76,6 @@ class EdgesProblem:
         some: a few scans of each drive.
         region: where starts are searched.
         centre: what the weak priors are centred on.
-        motion: what motion alone says, or None.
         known: what is known beside the edges: motion, and the weak priors.
     """
 
@@ -84,7 +83,6 @@ class EdgesProblem:
     some: JointProblem
     region: SearchRegion
     centre: State
-    motion: MotionSolution | None
     known: KnownCalibration
 
     @cached_property
@@ -213,7 +211,7 @@ def edges_problem(
     parts = [drive.part(own) for drive, own in zip(drives, scans, strict=True)]
     tracks = [joint.tracks.part(number, own) for number, own in enumerate(scans)]
     some = replace(whole, drives=parts, tracks=Tracks.joined(tracks))
-    return EdgesProblem(whole, some, replace(region, cTl=pose), centre, motion, known)
+    return EdgesProblem(whole, some, replace(region, cTl=pose), centre, known)
 
 
 def _some_scans(drive: Drive, time_offset_s: float) -> list[int]:

@@ -86,7 +86,7 @@ def edge_contrast_steps(
     return contrast_of(own, around, other)
 
 
-def contrast_of(own: float, around: Sequence[float], other: float = 0.0) -> EdgeContrast:
+def contrast_of(own: float, around: Sequence[float], other: float) -> EdgeContrast:
     """How far a score stands out from those of random rotations.
 
     Args:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from sst_graph.cli.messages import mention
 from sst_graph.cli.output_places import PNG_FILE, check_apart
+from sst_graph.cli.outputs import nominal_of, start_of
 from sst_graph.cli.pictures import ShownFrame, overlay, png, position_of
 from sst_graph.cli.progress import ProgressBar
 from sst_graph.cli.reading import open_drive_of
@@ -35,11 +36,9 @@ def run(args: argparse.Namespace) -> int:
     inputs = {"RESULT": result_file(args.result), "DATA": args.data, "--before": args.before}
     check_apart(inputs, {"--out": args.out})
     with output_file(args.out, args.overwrite, PNG_FILE) as out:
-        result = read_result(args.result)
-        source = with_sweep_of(open_drive_of(args, args.data, result, args.result), result.diagnostics)
+        result, source, before = _read(args)
         drive = RecentReader(source)
         position = len(drive) // 2 if args.frame is None else position_of(drive, args.frame)
-        before = _before(args.before, result, source)
         shown = ShownFrame.of(drive, position, result)
         out.write_bytes(png(overlay(shown, result, before)))
     mention(f"wrote {args.out}: frame {drive.number(position)} of {source.name}")
@@ -53,25 +52,29 @@ def _write_video(args: argparse.Namespace) -> int:
     inputs = {"RESULT": result_file(args.result), "DATA": args.data, "--before": args.before}
     check_apart(inputs, {"--video": args.video})
     with output_file(args.video, args.overwrite, VIDEO_FILE) as out:
-        result = read_result(args.result)
-        source = with_sweep_of(open_drive_of(args, args.data, result, args.result), result.diagnostics)
-        drives = [(source, _before(args.before, result, source))]
+        result, source, before = _read(args)
         with ProgressBar() as progress:
-            count = write_drive_video(out.partial, args.video, result, drives, progress.stage("video"))
+            stage = progress.stage("video")
+            count = write_drive_video(out.partial, args.video, result, [(source, before)], stage)
         out.publish()
     mention(f"wrote {args.video}: {count_of(count, 'frame')} of {source.name}")
     return 0
 
 
+def _read(args: argparse.Namespace) -> tuple[CalibrationResult, Source, Placement | None]:
+    """The result, its drive, and what it is compared with."""
+    result = read_result(args.result)
+    source = with_sweep_of(open_drive_of(args, args.data, result, args.result), result.diagnostics)
+    return result, source, _before(args.before, result, source)
+
+
 def _before(choice: str, result: CalibrationResult, source: Source) -> Placement | None:
     """What to compare with; None for a result that had no start."""
     if choice == "initial":
-        if result.initial is None:
-            return None
-        return Placement(result.initial, result.initial_time_offset_s, "before (start)")
+        return start_of(result)
     if choice == "dataset":
-        if source.nominal is None:
+        if (nominal := nominal_of(source)) is None:
             raise ConfigError(f"{source.name} brings no nominal calibration to compare with")
-        return Placement(source.nominal, 0.0, "before (nominal)")
+        return nominal
     cTl, time_offset_s = load_initial(Path(choice), result.camera_name)
     return Placement(cTl, time_offset_s, f"before ({Path(choice).name})")

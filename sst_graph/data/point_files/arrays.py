@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from sst_graph.data.arrays import MAX_POINTS
 from sst_graph.data.point_files.cloud import MAX_POINT_BYTES, Cloud, check_count, cloud_of, structured_fields
-from sst_graph.errors import DataError, count_of
+from sst_graph.errors import DataError, count_of, first_line
 
 _MAX_BYTES = 512 * 1024 * 1024
 """Of one array, unpacked."""
@@ -80,7 +80,7 @@ def read_npz(data: bytes, path: Path) -> Cloud:
                     content = stream.read(member.file_size + 1)
                 arrays[member.filename.removesuffix(".npy")] = _array(content, path)
     except (*_BROKEN, NotImplementedError, RuntimeError) as error:
-        raise DataError(path, f"no .npz file ({_line(error)})", "arrays that NumPy wrote") from None
+        raise DataError(path, f"no .npz file ({first_line(error)})", "arrays that NumPy wrote") from None
     for name, array in arrays.items():
         fields.update(_fields(array, path) if name == "points" else {name: array})
     return cloud_of(path, fields)
@@ -98,7 +98,7 @@ def _array(data: bytes, path: Path) -> NDArray[Any]:
         )
         shape, fortran, dtype = read_header(stream, max_header_size=_MAX_HEADER)
     except (*_BROKEN, RecursionError, MemoryError) as error:
-        raise DataError(path, f"no .npy file ({_line(error)})", "an array that NumPy wrote") from None
+        raise DataError(path, f"no .npy file ({first_line(error)})", "an array that NumPy wrote") from None
     if (
         dtype.subdtype is not None
         or dtype.hasobject
@@ -128,7 +128,3 @@ def _fields(array: NDArray[Any], path: Path) -> dict[str, NDArray[Any]]:
     if array.ndim != 2 or array.shape[1] not in (3, 4):
         raise DataError(path, f"an array of shape {array.shape}", "(n, 3) or (n, 4), or records with x, y, z")
     return {name: array[:, k] for k, name in enumerate(_COLUMNS[: array.shape[1]])}
-
-
-def _line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]

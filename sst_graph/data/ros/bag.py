@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.errors import DataError, MissingDependencyError, SstGraphError, count_of
+from sst_graph.errors import DataError, MissingDependencyError, SstGraphError, count_of, one_line
 
 WHOLE_BAG = (
     "a whole ROS 1 bag, rosbag2 folder or mcap file; one that was cut short is repaired with "
@@ -234,7 +234,7 @@ class Bag:
             raise _unreadable(self.path, error) from error
 
 
-def message_types(is_ros1: bool = False) -> Any:
+def message_types(is_ros1: bool) -> Any:
     """Definitions of the messages, a typestore of rosbags."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -252,5 +252,4 @@ def _close(reader: Any) -> None:
 
 def _unreadable(path: Path, error: Exception) -> DataError:
     """What rosbags and the decoders below it raise on damaged bytes has no common root."""
-    text = " ".join(str(error).split()) or type(error).__name__
-    return DataError(path, f"a bag that cannot be read ({text})", WHOLE_BAG)
+    return DataError(path, f"a bag that cannot be read ({one_line(error)})", WHOLE_BAG)

@@ -30,6 +30,10 @@ class ImageGeometry:
     model: CameraModel
     cRo: gtsam.Rot3
 
+    def extrinsic(self, oTl: gtsam.Pose3) -> gtsam.Pose3:
+        """cTl from the pose of the LiDAR in the optical frame."""
+        return gtsam.Pose3(self.cRo, np.zeros(3)) * oTl
+
 
 def image_geometry(message: Any, image_topic: str, size: Size, place: str) -> ImageGeometry:
     """Geometry of images of ``size`` by their CameraInfo.

@@ -9,7 +9,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -121,7 +120,7 @@ def open_ros(path: Path, options: SourceOptions) -> Source:
     size = _size(bag, topics, index)
     geometry = image_geometry(index.info, topics.image.name, size, f"{path}, {topics.info.name}")
     oTl, reason = index.transforms.pose(index.image_frame, index.cloud_frame)
-    nominal = None if oTl is None else gtsam.Pose3(geometry.cRo, np.zeros(3)) * oTl
+    nominal = None if oTl is None else geometry.extrinsic(oTl)
     if nominal is None:
         _LOG.info("%s: no nominal extrinsic: %s", printable(path), reason)
     encoding, timing = _encoding(bag, topics, index, options), _timing(options, index)

@@ -16,10 +16,9 @@ import sst_graph
 from sst_graph.batch import CalibrationConfig, calibrate_prepared
 from sst_graph.config import to_dict
 from sst_graph.drive.preparation import Drive, prepare_drive
-from sst_graph.errors import ConfigError
 from sst_graph.experiments.paper.config import START, VARIANTS, PaperTableConfig
 from sst_graph.experiments.paper.drives import TableDrive
-from sst_graph.experiments.starts import start_near
+from sst_graph.experiments.starts import start_near, truth_of
 from sst_graph.files.strict_json import strict_json
 from sst_graph.metrics import calibration_errors
 from sst_graph.odometry.sweep import with_sweep
@@ -119,18 +118,17 @@ def runs_of(cases: Sequence[Case], config: PaperTableConfig) -> Iterator[Run]:
         ConfigError, DataError: the drive cannot be used.
     """
     source = cases[0].drive.open(config, cases[0].images_late)
-    if source.truth is None:
-        raise ConfigError(f"{source.name}: found no reference calibration, expected one")
+    truth = truth_of(source)
     prepared: list[Drive] = []
     for case in cases:
-        start = start_of(case, config, source.truth.cTl)
+        start = start_of(case, config, truth.cTl)
         if case.method == START:
-            yield _run(case, start, None, source.truth)
+            yield _run(case, start, None, truth)
             continue
         prepared = prepared or [prepared_drive(source, config.calibration)]
         result = calibrate_prepared(prepared, start, config.calibration_of(case.method))
         offset_s = result.time_offset_s if VARIANTS[case.method].has_time_offset else None
-        run = _run(case, result.T_camera_lidar, offset_s, source.truth)
+        run = _run(case, result.T_camera_lidar, offset_s, truth)
         yield dataclasses.replace(run, status=result.status, estimated=bool(result.frames_used))
 
 

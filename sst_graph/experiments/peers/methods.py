@@ -23,23 +23,19 @@ class PeerMethod:
 
     Attributes:
         solve: refines a start.
-        source: paper or repository.
         rotation_only: whether it leaves the translation at the start.
     """
 
     solve: Peer
-    source: str
     rotation_only: bool = False
 
 
 PEERS: Mapping[str, PeerMethod] = {
-    "nid": PeerMethod(solve_nid, "direct_visual_lidar_calibration, Koide et al. 2023"),
-    "calib-anything": PeerMethod(solve_mask_consistency, "CalibAnything, Luo et al. 2023, on given masks"),
-    "levinson-thrun": PeerMethod(solve_depth_edges, "Levinson and Thrun 2013"),
-    "mutual-information": PeerMethod(solve_mutual_information, "Pandey et al. 2012"),
-    "scipy": PeerMethod(solve_least_squares, "the paper's residuals in scipy.optimize.least_squares"),
-    "hand-eye": PeerMethod(
-        solve_hand_eye, "cv2.calibrateHandEye (OpenCV 4), Park and Martin 1994", rotation_only=True
-    ),
+    "nid": PeerMethod(solve_nid),  # direct_visual_lidar_calibration, Koide et al. 2023
+    "calib-anything": PeerMethod(solve_mask_consistency),  # CalibAnything, Luo et al. 2023, on given masks
+    "levinson-thrun": PeerMethod(solve_depth_edges),  # Levinson and Thrun 2013
+    "mutual-information": PeerMethod(solve_mutual_information),  # Pandey et al. 2012
+    "scipy": PeerMethod(solve_least_squares),  # the paper's residuals in scipy.optimize.least_squares
+    "hand-eye": PeerMethod(solve_hand_eye, rotation_only=True),  # cv2.calibrateHandEye, Park and Martin 1994
 }
 NAMES = (*OWN, *PEERS)

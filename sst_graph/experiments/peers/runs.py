@@ -20,7 +20,7 @@ from sst_graph.drive.preparation import Drive, prepare_drive
 from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.experiments.peers.frames import PeerProblem, peer_frames
 from sst_graph.experiments.peers.methods import NAMES, PEERS
-from sst_graph.experiments.starts import start_near
+from sst_graph.experiments.starts import start_near, truth_of
 from sst_graph.metrics import calibration_errors
 from sst_graph.odometry.sweep import with_sweep
 from sst_graph.result import CalibrationResult
@@ -212,9 +212,7 @@ def _read(place: str, number: int, config: PeersConfig) -> _ReadDrive:
         source = open_source(place, image_shift=config.image_shift)
     else:
         source = simulate(dataclasses.replace(config.street, seed=config.seed + number))
-    truth = source.truth
-    if truth is None:
-        raise ConfigError(f"{source.name}: found no reference calibration, expected one")
+    truth = truth_of(source)
     swept = with_sweep(source, config.calibration.decide_sweep)
     drive = prepare_drive(swept, config.calibration.classes, config.calibration.prepare)
     offset_s = truth.time_offset_s or 0.0

@@ -141,13 +141,12 @@ class _Knots:
     """The 4 x 4 pixels around each of m points in the image.
 
     Attributes:
-        some: (m,) which points; uvs (m, 2) [px].
+        some: (m,) which points.
         cells: (m, 4, 4) of the joint histogram, flat.
         rows, columns: (m, 4) weights; rows_by_v, columns_by_u (m, 4) their derivatives [1/px].
     """
 
     some: NDArray[np.intp]
-    uvs: FloatArray
     cells: NDArray[np.intp]
     rows: FloatArray
     columns: FloatArray
@@ -168,7 +167,7 @@ class _Knots:
         rows = np.clip(base[:, 1, None] + around, 0, h - 1)
         grey = (seen.grey[rows[:, :, None], columns[:, None, :]].astype(np.intp) * _NID_BINS) >> 8
         cells = grey * _NID_BINS + level[:, None, None]
-        return cls(some, uvs, cells, weights[:, 1], weights[:, 0], slopes[:, 1], slopes[:, 0])
+        return cls(some, cells, weights[:, 1], weights[:, 0], slopes[:, 1], slopes[:, 0])
 
     def joint(self) -> FloatArray:
         """(bins, bins) joint histogram of grey levels and intensities, weighted over 4 x 4 pixels."""

@@ -12,8 +12,9 @@ import numpy as np
 
 from sst_graph.errors import count_of
 from sst_graph.fleet.drives import file_name
-from sst_graph.fleet.summary.tables import HUMAN, Row
+from sst_graph.fleet.summary.tables import Row
 from sst_graph.fleet.vehicles.fused import Vehicle
+from sst_graph.inspect.inspection import HUMAN
 from sst_graph.report.chart import Chart
 from sst_graph.report.html import bullets, details, figure, grid, paragraph, section, text
 

@@ -13,6 +13,7 @@ import numpy as np
 from sst_graph.fleet.drives import Drive
 from sst_graph.fleet.record import Record
 from sst_graph.fleet.vehicles.fused import Vehicle
+from sst_graph.inspect.inspection import HUMAN
 
 Row = dict[str, str | int | float | None]
 
@@ -26,8 +27,6 @@ _SIGMAS = (
     "sigma_time_offset_ms",
 )
 _POSE = ("trans_x_m", "trans_y_m", "trans_z_m", "quat_x", "quat_y", "quat_z", "quat_w", "time_offset_s")
-HUMAN = np.array([180.0 / np.pi] * 3 + [100.0] * 3 + [1000.0])
-"""From rad, m, s to deg, cm, ms."""
 
 
 def drive_rows(

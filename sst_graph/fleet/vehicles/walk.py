@@ -137,7 +137,7 @@ def walked(marginal: CalibrationMarginal, days: float, config: WalkConfig) -> Ca
     """What a marginal says after a random walk of so many days."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     graph.add(marginal.factor(_E(0), _D(0)))
-    for factor in _walk(0, 1, days, config):
+    for factor in _walk(days, config):
         graph.add(factor)
     cTl, time_offset_s = marginal.best()
     for k in (0, 1):
@@ -146,15 +146,13 @@ def walked(marginal: CalibrationMarginal, days: float, config: WalkConfig) -> Ca
     return marginal_of_graph(graph, values, _E(1), _D(1))
 
 
-def _walk(
-    a: int, b: int, days: float, config: WalkConfig
-) -> tuple[gtsam.BetweenFactorPose3, gtsam.NoiseModelFactor]:
+def _walk(days: float, config: WalkConfig) -> tuple[gtsam.BetweenFactorPose3, gtsam.NoiseModelFactor]:
     """The ties between two drives."""
     seconds, root = max(days, _LEAST_DAYS) * _DAY_S, np.sqrt(_DAY_S)
     rotation, translation = np.radians(config.rotation_deg) / root, config.translation_m / root
     return (
-        extrinsic_drift(_E(a), _E(b), seconds, rotation, translation),
-        time_offset_drift(_D(a), _D(b), seconds, config.time_offset_s / root),
+        extrinsic_drift(_E(0), _E(1), seconds, rotation, translation),
+        time_offset_drift(_D(0), _D(1), seconds, config.time_offset_s / root),
     )
 
 

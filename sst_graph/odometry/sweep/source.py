@@ -8,7 +8,6 @@ from typing import Any
 
 from sst_graph.data.frame_parts import (
     AheadReader,
-    image_at,
     scan_at,
     scan_positions,
 )
@@ -16,7 +15,7 @@ from sst_graph.data.source_view import SourceView
 from sst_graph.errors import ConfigError
 from sst_graph.odometry.sweep.decision import SweepDecision, decide_sweep
 from sst_graph.sweep_timing import SweepStamp, SweepTiming
-from sst_graph.types import CameraImage, Frame, Scan, Source
+from sst_graph.types import Frame, Scan, Source
 
 SWEEP_KEY = "sweep"
 """Where a result's diagnostics keep what was decided of the sweeps, by name of the drive."""
@@ -44,10 +43,6 @@ class SweptSource(SourceView):
     def read_scan(self, position: int) -> Scan | None:
         """Scan of the frame at a position."""
         return self._timed(scan_at(self.source, position))
-
-    def read_image(self, position: int) -> CameraImage | None:
-        """Image of the frame at a position."""
-        return image_at(self.source, position)
 
     def _timed(self, scan: Scan | None) -> Scan | None:
         timing = self.sweep_decision.timing

@@ -21,7 +21,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from sst_graph.odometry.cloud import compensate_sweep, usable_points
-from sst_graph.odometry.lidar import MOVABLE_CLASSES, LidarOdometry
+from sst_graph.odometry.lidar import MOVABLE_CLASSES, LidarOdometry, orthonormal
 from sst_graph.odometry.static_points import on_static_objects
 from sst_graph.sweep_timing import turned
 from sst_graph.types import Scan
@@ -93,13 +93,11 @@ class Normal:
     Attributes:
         H, g: (1 + SECTORS, 1 + SECTORS) and (1 + SECTORS,).
         back: (6 n, 1 + SECTORS) and (6 n,): the poses' step is back[0] @ u + back[1]; a window's own.
-        rows: number of matches.
     """
 
     H: FloatArray
     g: FloatArray
     back: tuple[FloatArray, FloatArray] = field(repr=False)
-    rows: int = 0
 
 
 @dataclass(frozen=True)
@@ -141,12 +139,10 @@ class Errors:
         own: of one match around what its cell's matches share.
         shared: of that: what vegetation, edges, sparse rings and the LiDAR's own calibration leave, however
             many points there are.
-        weight: of the matches.
     """
 
     own: float
     shared: float
-    weight: float
 
 
 class Window:
@@ -240,7 +236,7 @@ class Window:
         """Move the poses by the step that goes with a step (1 + SECTORS,) of the times."""
         steps = (normal.back[0] @ u + normal.back[1]).reshape(-1, 6)
         self._poses = [
-            np.asarray((gtsam.Pose3(_orthonormal(pose)) * gtsam.Pose3.Expmap(step)).matrix())
+            np.asarray((gtsam.Pose3(orthonormal(pose)) * gtsam.Pose3.Expmap(step)).matrix())
             for pose, step in zip(self._poses, steps, strict=True)
         ]
 
@@ -288,7 +284,7 @@ class Window:
         many = amount > _MIN_WEIGHT
         spread = 1.4826 * float(np.median(np.abs(shared[many]))) if many.any() else 0.0
         total = max(float(amount.sum()), 1e-9)
-        return Errors(max(around / total, 1e-12), spread**2, total)
+        return Errors(max(around / total, 1e-12), spread**2)
 
     @property
     def has_matches(self) -> bool:
@@ -303,8 +299,9 @@ class Window:
             np.concatenate([rows.residuals for rows in self._matches]),
         )
 
-    def misfit(self, scale: float = _SCALES_M[-1]) -> float:
+    def misfit(self) -> float:
         """Mean robust misfit of the chosen points, 0 (all on a surface) to 1 (none near one)."""
+        scale = _SCALES_M[-1]
         good = sum(float((1.0 / (1.0 + (rows.residuals / scale) ** 2)).sum()) for rows in self._matches)
         count = sum(len(self._surfaces[rows.scans[1]].chosen) for rows in self._matches)
         return 1.0 - good / max(count, 1)
@@ -345,7 +342,7 @@ class Window:
         """Normal equations of all rows with the poses, of which the first stays, eliminated."""
         size, columns = 6 * len(self._poses), 1 + SECTORS
         Hpp, Hpu, gp = np.zeros((size, size)), np.zeros((size, columns)), np.zeros(size)
-        Huu, gu, count = np.zeros((columns, columns)), np.zeros(columns), 0
+        Huu, gu = np.zeros((columns, columns)), np.zeros(columns)
         for rows in self._matches:
             a, b = rows.scans
             at = np.concatenate([np.arange(6 * a, 6 * a + 6), np.arange(6 * b, 6 * b + 6)])
@@ -356,13 +353,12 @@ class Window:
             weighted = rows.weights[:, None] * rows.of_times
             Huu += weighted.T @ rows.of_times
             gu -= weighted.T @ rows.residuals
-            count += len(rows.residuals)
         Hpp[:6, :6] += 1e9 * np.eye(6)
         Hpp[np.diag_indices(size)] += _DAMPING
         toward = np.linalg.solve(Hpp, np.column_stack([Hpu, gp]))
         toward = np.asarray(toward, np.float64)
         back = (np.asarray(-toward[:, :-1], np.float64), np.asarray(toward[:, -1], np.float64))
-        return Normal(Huu - Hpu.T @ toward[:, :-1], gu - Hpu.T @ toward[:, -1], back, count)
+        return Normal(Huu - Hpu.T @ toward[:, :-1], gu - Hpu.T @ toward[:, -1], back)
 
 
 _SECTORS_PER_VIEW = 3
@@ -440,7 +436,3 @@ def _odometry(scans: Sequence[Scan]) -> tuple[bool, list[FloatArray]]:
         ok &= motion is not None and motion.ok
         poses.append(np.asarray(odometry.pose.matrix()))
     return ok, poses
-
-
-def _orthonormal(matrix: FloatArray) -> FloatArray:
-    return np.asarray(gtsam.Pose3(gtsam.Rot3.ClosestTo(matrix[:3, :3]), matrix[:3, 3]).matrix())

@@ -72,7 +72,7 @@ def review_steps(
     return EdgeReview(reasons, spread_covariance(halves), np.asarray(farther))
 
 
-def softness(review: EdgeReview, covariance: FloatArray) -> float:
+def variance_ratio(review: EdgeReview, covariance: FloatArray) -> float:
     """How many times the variance of an estimate by edges is that by frozen matches, on average; 1 without
     edges.
 

@@ -114,7 +114,7 @@ class EdgeReviews:
         share, steps = uncertainty.edge_share, uncertainty.edge_steps
         return np.asarray(share @ own @ share.T + steps.T @ steps)
 
-    def doubts(self, uncertainty: Uncertainty) -> tuple[str, ...]:
+    def reasons_for(self, uncertainty: Uncertainty) -> tuple[str, ...]:
         """The reasons, where edges have a share in the estimate."""
         counts = float(np.abs(np.diag(uncertainty.edge_share)).max(initial=0.0)) > _LEAST_SHARE
         return self.reasons if counts else ()

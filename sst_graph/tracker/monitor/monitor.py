@@ -68,5 +68,5 @@ class Monitor:
         assert estimate.smoother is not None
         scans, compared = list(estimate.smoother.entries), estimate.for_comparison()
         self.changes.check_start_at_end(scans, compared)
-        if estimate.edges is not None and not estimate.doubts:
+        if estimate.edges is not None and not estimate.reasons:
             self.changes.confirm_at_end(scans, compared)

@@ -162,7 +162,7 @@ class ChangeStatistic:
         object_sigma_px: standard deviation of a new object's mask bias from its class's [px].
         recent: scores of the latest frames.
         usual: T of earlier quiet frames.
-        softness: how many times the variance of the scores is that of frozen matches: edges of pictures
+        variance_ratio: how many times the variance of the scores is that of frozen matches: edges of pictures
             follow the pose, contours of masks do not.
         exceeded: frames in a row past the threshold.
         latest: the latest comparison; None before one.
@@ -172,7 +172,7 @@ class ChangeStatistic:
         self.threshold, self.object_sigma_px = threshold, object_sigma_px
         self.recent: deque[LinearizedPair] = deque(maxlen=FRAMES)
         self.usual: deque[float] = deque(maxlen=_USUAL_FRAMES)
-        self.softness = 1.0
+        self.variance_ratio = 1.0
         self.exceeded = 0
         self.latest: Comparison | None = None
 
@@ -226,11 +226,11 @@ class ChangeStatistic:
         return self.exceeded >= CONFIRMATIONS
 
     def _scale(self, freedom: int) -> float:
-        """How much larger than chi-squared's the usual 90th percentile is; at least 1, or the softness."""
+        """How much larger than chi-squared's the usual 90th percentile is; at least the variance ratio."""
         if len(self.usual) < _LEAST_USUAL_FRAMES:
-            return self.softness
+            return self.variance_ratio
         expected = freedom + 1.28 * float(np.sqrt(2.0 * freedom))
-        return max(self.softness, float(np.quantile(self.usual, 0.9)) / expected)
+        return max(self.variance_ratio, float(np.quantile(self.usual, 0.9)) / expected)
 
 
 def _squared(gradient: FloatArray, variance: FloatArray) -> float:

@@ -9,7 +9,7 @@ from sst_graph.batch.lower_edges import LowerEdgeSupport
 from sst_graph.errors import EstimationError
 from sst_graph.stepwise import Stepwise
 from sst_graph.tracker.by_edges.kinds import by_edges, by_labels, of_kind
-from sst_graph.tracker.by_edges.review import softness
+from sst_graph.tracker.by_edges.review import variance_ratio
 from sst_graph.tracker.by_edges.start import first_edge_estimate_steps
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.spread_work import NUMERICAL_ERRORS, SpreadWork
@@ -77,9 +77,9 @@ class Initialization:
     first: FirstEstimate
 
     @property
-    def softness(self) -> float:
-        """Of its matches (:func:`~sst_graph.tracker.by_edges.review.softness`)."""
-        return softness(self.first.review, self.uncertainty.covariance)
+    def variance_ratio(self) -> float:
+        """Of its matches (:func:`~sst_graph.tracker.by_edges.review.variance_ratio`)."""
+        return variance_ratio(self.first.review, self.uncertainty.covariance)
 
 
 def start_steps(stretch: Stretch, guess: StartGuess, config: TrackerConfig) -> Stepwise[FirstEstimate]:

@@ -13,7 +13,7 @@ from sst_graph.covariance.error_model import SideResiduals
 from sst_graph.covariance.match_table import curvatures_of, unweighted
 from sst_graph.covariance.static_objects import dynamic_matches
 from sst_graph.covariance.sums import ScoreSums
-from sst_graph.drive.trajectory import camera_twist
+from sst_graph.drive.twists import camera_twist
 from sst_graph.factors.alignment import weighted_residuals
 from sst_graph.factors.motion import twist_ad
 from sst_graph.graph.building import UNKNOWN_TWIST_SIGMAS

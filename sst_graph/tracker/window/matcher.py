@@ -12,7 +12,7 @@ from sst_graph.association.edge_matching import GATE
 from sst_graph.association.time_pairing import pair_by_time
 from sst_graph.batch.lower_edges import LowerEdgeSupport, lower_edge_support
 from sst_graph.drive.preparation import Drive, boundaries_of, boundary_count
-from sst_graph.drive.trajectory import GrowingTrack
+from sst_graph.drive.twists import GrowingTwists
 from sst_graph.factors import alignment_cost
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.matching import (
@@ -49,7 +49,7 @@ class WindowMatcher:
         self.held_names = held_names(self.graph.estimate, self.classes)
         self.kernel = RobustKernel("geman_mcclure", KERNELS_PX[-1])
         self._twists: tuple[int, Tracks] | None = None
-        self._growing = GrowingTrack(_SMOOTHED)
+        self._growing = GrowingTwists(_SMOOTHED)
         self._last: tuple[Point, dict[int, PairMatches]] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -102,7 +102,7 @@ class WindowMatcher:
         return found, set(numbers) - set(found)
 
     def linearized_at(
-        self, point: Point, chosen: Collection[int], kernel: RobustKernel, without: Collection[int] = ()
+        self, point: Point, chosen: Collection[int], kernel: RobustKernel, without: Collection[int]
     ) -> list[LinearizedPair]:
         """Some scans matched and linearized at a point, without the objects of some tracks."""
         return self.linearized(self.pairs_at(point, chosen, kernel), point, without)
@@ -112,7 +112,7 @@ class WindowMatcher:
         return self._pairs(point, chosen, kernel)[0]
 
     def linearized(
-        self, pairs: Mapping[int, PairMatches], point: Point, without: Collection[int] = ()
+        self, pairs: Mapping[int, PairMatches], point: Point, without: Collection[int]
     ) -> list[LinearizedPair]:
         """Matches of scans, made at a point, linearized there without the objects of some tracks."""
         if without:

@@ -143,7 +143,7 @@ class WindowRelinearization:
         """Whether all is done."""
         return self.passes == 0
 
-    def advance(self, point: Point, fewer: int = 0) -> list[int] | None:
+    def advance(self, point: Point, fewer: int) -> list[int] | None:
         """The scans to match with this frame; None while the support of the lower edges is counted.
 
         Args:

@@ -32,7 +32,7 @@ def scans_to_match(
     smoother: WindowSmoother,
     entered: Collection[int],
     covariance: FloatArray,
-    relinearization: WindowRelinearization | None = None,
+    relinearization: WindowRelinearization | None,
 ) -> set[int]:
     """The newest, those still without a pair, those that leave next, and some in turn.
 

@@ -16,7 +16,7 @@ from sst_graph.association.edge_matching import SIDES
 from sst_graph.assumptions import ASSUMPTIONS, named_sigmas
 from sst_graph.covariance.error_model import ErrorModel
 from sst_graph.covariance.jackknife import composed
-from sst_graph.errors import EstimationError
+from sst_graph.errors import EstimationError, one_line
 from sst_graph.factors import extrinsic_drift, time_offset_drift
 from sst_graph.graph.building import motion_factor, silhouettes_factor
 from sst_graph.graph.matching import GraphConfig
@@ -89,7 +89,7 @@ class WindowSmoother:
         classes: Sequence[SemanticClass],
         graph: GraphConfig,
         drift: DriftConfig,
-        begin: Point | None = None,
+        begin: Point | None,
     ) -> None:
         """
         Args:
@@ -163,7 +163,7 @@ class WindowSmoother:
         try:
             update.run()
         except (RuntimeError, ValueError, np.linalg.LinAlgError) as error:
-            raise EstimationError(f"the update failed: {' '.join(str(error).split())[:200]}") from error
+            raise EstimationError(f"the update failed: {one_line(error):.200}") from error
         self._keep(update)
 
     def _keep(self, update: SmootherUpdate) -> None:
@@ -200,7 +200,7 @@ class WindowSmoother:
         turn = extrinsic_drift(a[0], b[0], seconds, rate, drift.translation_m)
         return turn, time_offset_drift(a[1], b[1], seconds, drift.time_offset_s)
 
-    def optimize(self, iterations: int = 10) -> None:
+    def optimize(self, iterations: int) -> None:
         """Levenberg-Marquardt on the whole window, and a fresh iSAM2 linearized where it ends.
 
         Raises:
@@ -356,7 +356,7 @@ class WindowSmoother:
         """From the start of epoch i - 1 to that of epoch i [s]."""
         return max(1e-3, (self._epochs[i].start_ns - self._epochs[i - 1].start_ns) * 1e-9)
 
-    def covariance(self, information: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+    def covariance(self, information: FloatArray | None) -> tuple[FloatArray, FloatArray]:
         """(n, n) cluster-robust covariance of the unknowns of ``past``, and that of independent matches.
 
         Args:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def read_point(
-    isam: gtsam.ISAM2, keys: Sequence[int], tracks: tuple[int, ...] = (), names: tuple[str, ...] = ()
+    isam: gtsam.ISAM2, keys: Sequence[int], tracks: tuple[int, ...], names: tuple[str, ...]
 ) -> Point:
     """The estimate under [E, D, biases..., parameters..., biases of the objects...].
 

@@ -52,9 +52,10 @@ class TwistSamples:
         return TwistSample(self.twists[number], self.accelerations[number], self.covariances[number])
 
 
-class TwistTrack:
+class SensorTwists:
     """Twists over time: cubics between the middles of the measured intervals, carried on for half an interval
-    beyond the ends, constant from there.
+    beyond the ends, constant from there. Poses, only where the motion is known:
+    :class:`~sst_graph.drive.path.SensorPath`.
 
     At each middle, twist and acceleration are those of the parabola whose means over the interval and its two
     neighbours are the measured ones. Straight lines through the means would be 15 % short of a pitching
@@ -126,17 +127,17 @@ class TwistTrack:
 _AXES = np.arange(6)
 
 
-class GrowingTrack:
-    """Tracks of a LiDAR's motions of which some are new each time: smoothed, exactly zero at standstill."""
+class GrowingTwists:
+    """Twists by a LiDAR's motions of which some are new each time: smoothed, exactly zero at standstill."""
 
     def __init__(self, reach: int | None = None) -> None:
         """reach: how many of the latest motions are smoothed again each time; None: all."""
         self._zero_velocity, self._smoother = ZeroVelocityUpdate(), MotionSmoother(reach)
 
-    def of(self, motions: Sequence[RelativeMotion]) -> TwistTrack | None:
-        """The track of consecutive motions; None without any. Those of the call before are recognised by
+    def of(self, motions: Sequence[RelativeMotion]) -> SensorTwists | None:
+        """Those by consecutive motions; None without any. Motions of the call before are recognised by
         identity."""
-        return TwistTrack(self._smoother.smoothed(self._zero_velocity.apply(motions))) if motions else None
+        return SensorTwists(self._smoother.smoothed(self._zero_velocity.apply(motions))) if motions else None
 
 
 def _covariance(motion: RelativeMotion) -> FloatArray:
