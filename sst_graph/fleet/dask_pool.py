@@ -131,7 +131,7 @@ def _outcome(future: Any) -> Record | BaseException | None:
 
 def _failure(job: Job, error: BaseException, is_lost: bool) -> Record:
     """Why a task gave nothing: its workers were lost, or one could not run it."""
-    name, place = job.drive.name, job.drive.place.url
+    name, place = job.drive.name, job.place
     if is_lost:
         return Record(
             name, place, "killed", f"its Dask workers were lost, all that it had: {one_line(error):.500}"

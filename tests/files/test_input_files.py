@@ -65,7 +65,7 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path, monkeypatch:
         ]:
             with pytest.raises(DataError, match=f"found {found}.*, expected a note"):
                 read_file(name, NOTE)
-        assert time.monotonic() - began < 1.0
+        assert time.monotonic() - began < 10.0  # not for ever; the machine may be busy
 
 
 def test_a_sparse_giant_takes_no_memory(tmp_path: Path) -> None:
