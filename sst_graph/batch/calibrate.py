@@ -252,6 +252,7 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
         matched=MatchedDrives(problem, solution.state),
         by_sweeps=total.by_sweeps,
         sweep_reasons=total.reasons,
+        assumption_steps=considered.steps(),
     )
 
 

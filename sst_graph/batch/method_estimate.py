@@ -78,6 +78,8 @@ class MethodEstimate:
         by_sweeps: (7, 7) part of the covariance by sweeps that the scans leave undecided.
         sweep_reasons: those of the reasons that say that such sweeps matter.
         shared: errors that other cameras on the LiDAR have, too, of methods without ``solved``.
+        assumption_steps: (7,) step of the estimate by one deviation of each assumption that is considered in
+            the covariance, by name.
     """
 
     cTl: gtsam.Pose3
@@ -97,6 +99,7 @@ class MethodEstimate:
     by_sweeps: FloatArray = field(default_factory=lambda: np.zeros((7, 7)))
     sweep_reasons: tuple[str, ...] = ()
     shared: SharedErrors | None = None
+    assumption_steps: Mapping[str, FloatArray] = field(default_factory=dict)
 
 
 def result_of(

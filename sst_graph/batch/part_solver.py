@@ -125,7 +125,7 @@ class PartSolver:
         objects = [tracks_of_scans(self.problem.objects[part.drive], part.scans)]
         estimate = JointEstimate.of(solution, objects)
         considered = estimate.considered(self.problem.config.assumptions)
-        common = np.reshape([considered.step(name)[:7] for name in considered.sigmas], (-1, 7)).T
+        common = np.reshape([*considered.steps().values()], (-1, 7)).T
         # By static objects alone: a vehicle that brakes looks like another time offset.
         covariance = estimate.by_static_objects[:7, :7]
         step = difference(self.reference_of(part), solution.state)

@@ -118,6 +118,10 @@ class Considered:
         """(n,) step of the estimate by one deviation of a parameter."""
         return np.asarray(self.sigmas[name] * self.sensitivities[name])
 
+    def steps(self) -> dict[str, FloatArray]:
+        """(7,) step of extrinsic and first offset by one deviation of each parameter, by name."""
+        return {name: self.step(name)[:7] for name in self.sigmas}
+
     def part(self, name: str) -> FloatArray:
         """(n, n) covariance by one assumption."""
         step = self.step(name)

@@ -146,7 +146,9 @@ def _of_both_parts(labels: MethodEstimate, edges: MethodEstimate) -> MethodEstim
     fused = Fused.of(labels, edges)
     static = edges.covariance
     if labels.by_static_objects is not None:
-        static = Fused.of(replace(labels, covariance=labels.by_static_objects), edges).covariance
+        # It has no part by the assumptions.
+        of_static = replace(labels, covariance=labels.by_static_objects, assumption_steps={})
+        static = Fused.of(of_static, edges).covariance
     sweeps = dict.fromkeys((*labels.sweep_reasons, *edges.sweep_reasons))
     shares = np.diag(fused.by_sweeps) / np.diag(fused.covariance)
     # What a frame brought to the labels' estimate is not what it brought to this one.

@@ -77,6 +77,7 @@ class EdgesCovariance:
             JSON-able.
         reasons: why it may be too small.
         shared: what of it the other cameras on this LiDAR have, too.
+        assumption_steps: (7,) step by one deviation of each assumption, by name.
     """
 
     matrix: FloatArray
@@ -85,6 +86,7 @@ class EdgesCovariance:
     estimated: Mapping[str, Any]
     reasons: tuple[str, ...]
     shared: SharedErrors
+    assumption_steps: Mapping[str, FloatArray]
 
 
 def edges_covariance(
@@ -119,7 +121,8 @@ def edges_covariance(
     }
     total = np.asarray(sum(parts.values()), np.float64)
     sigmas = {name: np.sqrt(np.diag(part)).tolist() for name, part in parts.items()}
-    common = {name: considered.step(name)[:7] for name in OF_LIDAR if name in considered.sigmas}
+    by_assumption = considered.steps()
+    common = {name: step for name, step in by_assumption.items() if name in OF_LIDAR}
     common |= {name: positions.step(name) for name in positions.sigmas}
     # What no part of the model explains may be the LiDAR's.
     common |= {f"floor_{axis}": step for axis, step in enumerate(np.diag(FLOOR)) if step.any()}
@@ -128,7 +131,8 @@ def edges_covariance(
     shared = SharedErrors(steps, common)
     sigmas |= {"samples": shared.estimated}
     report, estimated = assumption_report(considered, tests), _estimated(estimate, parameter_steps)
-    return EdgesCovariance(total, sigmas, report, estimated, few_edges(steps, outlines), shared)
+    reasons = few_edges(steps, outlines)
+    return EdgesCovariance(total, sigmas, report, estimated, reasons, shared, by_assumption)
 
 
 def _estimated(estimate: JointEstimate, steps: Mapping[str, FloatArray]) -> dict[str, Any]:

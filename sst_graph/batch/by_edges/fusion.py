@@ -6,6 +6,11 @@ offset for each kind, which its matches are on, and between the copy and the cal
 covariance of what the kind's matches share beyond their own errors. The two kinds are of different frames,
 and share no other variable: what each says of the calibration is one Gaussian, its estimate and whole
 covariance, and the estimate of that graph is their product.
+
+Camera and LiDAR are the same for both: a principal point that is off moves both alike, which no weighting
+averages. With x_1 + K (x_2 - x_1) the estimate and X the covariance of the two by the assumptions, its
+covariance (I - K) C_1 (I - K)' + K C_2 K' grows by (I - K) X K' and the transpose of that, and the covariance
+of x_2 - x_1 shrinks by X + X'.
 """
 
 from __future__ import annotations
@@ -32,7 +37,7 @@ class Fused:
         covariance: (7, 7) larger where the two differ by more than theirs allow.
         by_sweeps: (7, 7) part of it by sweeps that the scans leave undecided.
         step: (7,) from the first to the second.
-        chi2: of 7, of that step under the sum of the covariances.
+        chi2: of 7, of that step under its covariance.
     """
 
     state: State
@@ -52,14 +57,23 @@ class Fused:
         step = difference(a, state_of(second))
         total = first.covariance + second.covariance
         gain = np.asarray(np.linalg.solve(total, first.covariance).T)
-        chi2 = float(step @ np.linalg.solve(total, step))
+        cross = _cross_covariance(first, second)
+        chi2 = float(step @ np.linalg.solve(total - cross - cross.T, step))
         moved, rest = gain @ step, np.eye(7) - gain
         covariance = rest @ first.covariance @ rest.T + gain @ second.covariance @ gain.T
+        covariance += rest @ cross @ gain.T + gain @ cross.T @ rest.T
         by_sweeps = rest @ first.by_sweeps @ rest.T + gain @ second.by_sweeps @ gain.T
         covariance += by_sweeps
         if chi2 > UNLIKELY_CHI2:
             covariance *= chi2 / 7.0
         return cls(a.moved(moved), 0.5 * (covariance + covariance.T), 2.0 * by_sweeps, step, chi2)
+
+
+def _cross_covariance(first: MethodEstimate, second: MethodEstimate) -> FloatArray:
+    """(7, 7) of the two by the assumptions that both consider."""
+    steps, others = first.assumption_steps, second.assumption_steps
+    cross = [np.outer(step, others[name]) for name, step in steps.items() if name in others]
+    return np.asarray(np.sum([np.zeros((7, 7)), *cross], axis=0), np.float64)
 
 
 def state_of(estimate: MethodEstimate) -> State:

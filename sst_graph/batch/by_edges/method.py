@@ -96,6 +96,7 @@ def edges_method(
         by_sweeps=sweeps.covariance,
         sweep_reasons=sweeps.reasons,
         shared=own.shared,
+        assumption_steps=own.assumption_steps,
     )
 
 

@@ -218,6 +218,34 @@ def test_weights_follow_the_sigmas() -> None:
     assert fused.chi2 == pytest.approx(7 * 0.25, rel=1e-6)
 
 
+def test_what_moves_both_parts_alike_is_not_averaged() -> None:
+    """A principal point that is off, drawn for both at once, among errors of their own."""
+    rng = np.random.default_rng(5)
+    sigmas, steps = np.full(7, 0.002), [{"cx": np.eye(7)[2] * size} for size in (0.01, 0.008)]
+    covariances = [np.diag(sigmas**2) + np.outer(step["cx"], step["cx"]) for step in steps]
+    errors, squared, claims = [], [], []
+    for _ in range(400):
+        shift = rng.normal()
+        first, second = (
+            replace(
+                estimate(gtsam.Pose3.Expmap(error[:6]), error[6], sigmas),
+                covariance=covariance,
+                assumption_steps=step,
+            )
+            for covariance, step in zip(covariances, steps, strict=True)
+            for error in [sigmas * rng.normal(size=7) + shift * step["cx"]]
+        )
+        fused = Fused.of(first, second)
+        squared.append(fused.chi2)
+        claims.append(fused.covariance[2, 2])
+        errors.append(np.append(gtsam.Pose3.Logmap(fused.state.cTl), fused.state.time_offsets_s[0]))
+    claimed = np.median(claims)
+    assert np.var([error[2] for error in errors]) == pytest.approx(claimed, rel=0.2)
+    assert np.mean(squared) == pytest.approx(7.0, rel=0.1)
+    apart = Fused.of(*(replace(part, assumption_steps={}) for part in (first, second)))
+    assert apart.covariance[2, 2] < 0.6 * claimed
+
+
 def test_parts_that_contradict_each_other_are_not_trusted() -> None:
     sigmas = np.array([*np.radians([0.1] * 3), 0.01, 0.01, 0.01, 0.003])
     one = estimate(gtsam.Pose3(), 0.0, sigmas)
