@@ -71,7 +71,7 @@ def total_covariance(
     motion = motion_covariance(estimate.robust, solution.pairs, solution.state, joint.graph)
     shifts = image_shifts(estimate.robust, solution.pairs, solution.values, solution.state)
     parts = budget(estimate.covariance, motion, shifts.covariance, considered)
-    unknowns = (estimate.covariance + shifts.covariance)[:size, :size] + considered.covariance(size)
+    unknowns = estimate.covariance[:size, :size] + shifts.covariance + considered.covariance(size)
     # 2. Motion that nothing measures.
     known = unknowns[:7, :7] + _unknown_motion(problem, solution, float(unknowns[6, 6]))
     # 3. Sweeps.

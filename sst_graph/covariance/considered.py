@@ -222,7 +222,7 @@ def budget(
     Args:
         covariance: (n, n) of matches and motion.
         motion: (n, n) part of it, by :func:`motion_covariance`.
-        shifts: (n, n) by pictures that shift from image to image.
+        shifts: (s, s) by pictures that shift from image to image.
         considered: by the assumptions.
     """
     moved = np.clip(np.diag(motion)[:7], 0.0, np.diag(covariance)[:7])

@@ -44,7 +44,7 @@ class ImageShifts:
 
     Attributes:
         sigmas_px: (2,) deviation of the shift across and down [px].
-        covariance: (n, n) of the unknowns by it.
+        covariance: (s, s) of extrinsic and offsets by it.
     """
 
     sigmas_px: FloatArray
@@ -75,7 +75,8 @@ def image_shifts(
     H = weighted_columns(robust.table, pairs, columns_of(pairs, values, state, ("cx", "cy")))
     numbers: dict[tuple[int, int], int] = {}
     of_pair = [numbers.setdefault((pair.drive, pair.pair.image), len(numbers)) for pair in pairs]
-    return shifts_of(robust.table, robust.bread, H, np.repeat(of_pair, [len(pair) for pair in pairs]))
+    images = np.repeat(of_pair, [len(pair) for pair in pairs])
+    return shifts_of(robust.table, robust.bread[: 6 + len(state.time_offsets_s)], H, images)
 
 
 def shifts_of(table: MatchTable, bread: FloatArray, H: FloatArray, images: IntArray) -> ImageShifts:
@@ -83,7 +84,7 @@ def shifts_of(table: MatchTable, bread: FloatArray, H: FloatArray, images: IntAr
 
     Args:
         table: the matches.
-        bread: (n, n) inverse of the information.
+        bread: (s, n) inverse of the information, rows of those unknowns whose covariance is wanted.
         H: (m, 2) derivatives of the residuals by a shift of the picture, weighted [1/px].
         images: (m,) number of the image, from 0 on.
     """
@@ -96,7 +97,7 @@ def shifts_of(table: MatchTable, bread: FloatArray, H: FloatArray, images: IntAr
     variances = _variances([fit for fit in fits if fit is not None])
     # 2. What it does to the estimate.
     effects = [bread @ (table.J[own].T @ H[own]) for own in members]
-    covariance = sum(((G * variances) @ G.T for G in effects), np.zeros_like(bread))
+    covariance = sum(((G * variances) @ G.T for G in effects), np.zeros((len(bread), len(bread))))
     return ImageShifts(np.sqrt(variances), np.asarray(covariance))
 
 
