@@ -125,11 +125,10 @@ class PartSolver:
         objects = [tracks_of_scans(self.problem.objects[part.drive], part.scans)]
         estimate = JointEstimate.of(solution, objects)
         considered = estimate.considered(self.problem.config.assumptions)
-        common = np.reshape([*considered.steps().values()], (-1, 7)).T
         # By static objects alone: a vehicle that brakes looks like another time offset.
         covariance = estimate.by_static_objects[:7, :7]
         step = difference(self.reference_of(part), solution.state)
-        return PartEstimate(step, covariance, estimate.robust.table.clusters, common)
+        return PartEstimate(step, covariance, estimate.robust.table.clusters, considered.steps())
 
     def _data(self, part: Part) -> tuple[Drive, Tracks]:
         """The drive and its tracks, of the part's scans alone."""

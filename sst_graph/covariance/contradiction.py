@@ -10,7 +10,7 @@ that a part does not determine has a large variance in the difference and so doe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 
@@ -43,15 +43,19 @@ class PartEstimate:
             (right perturbation: rotation [rad], translation [m], offset [s]).
         covariance: (7, 7) of it, cluster-robust.
         clusters: effective number of independent clusters (sides of objects) that the covariance rests on.
-        common: (7, k) shift of the estimate by one deviation of each of k errors that all parts share, such
-            as a principal point that is off; what shifts both parts alike is no contradiction, and does not
-            hide one.
+        common: (7,) shift of the estimate by one deviation of each error that all parts share, by its name,
+            such as a principal point that is off; what shifts both parts alike is no contradiction, and does
+            not hide one.
     """
 
     step: FloatArray
     covariance: FloatArray
     clusters: float = np.inf
-    common: FloatArray = field(default_factory=lambda: np.zeros((7, 0)))
+    common: Mapping[str, FloatArray] = field(default_factory=dict)
+
+    def shift(self, name: str) -> FloatArray:
+        """(7,) by one deviation of a common error; 0 of one that the part does not have."""
+        return self.common.get(name, np.zeros(7))
 
 
 @dataclass(frozen=True)
@@ -79,9 +83,10 @@ class Difference:
             own_offsets: each part has a time offset of its own: only the extrinsics are compared.
         """
         n = 6 if own_offsets else 7
-        common = _padded(other.common, one.common) - _padded(one.common, other.common)
+        shifts = [other.shift(name) - one.shift(name) for name in _names(one, other)]
+        apart = np.reshape(shifts, (-1, 7))
         step = (other.step - one.step)[:n]
-        covariance = (one.covariance + other.covariance + common @ common.T)[:n, :n]
+        covariance = (one.covariance + other.covariance + apart.T @ apart)[:n, :n]
         along = np.linalg.solve(covariance, step)
         total = max(float(along @ covariance @ along), 1e-300)
         freedom = sum(
@@ -113,16 +118,19 @@ def combined(parts: Sequence[PartEstimate]) -> PartEstimate:
     """The estimate of several independent parts together, weighted by their information."""
     information = [np.linalg.inv(part.covariance) for part in parts]
     covariance = np.asarray(np.linalg.inv(np.sum(information, axis=0)))
-    weighted, common = (
-        covariance @ np.sum([H @ each for H, each in zip(information, values, strict=True)], axis=0)
-        for values in ([part.step for part in parts], [part.common for part in parts])
-    )
-    return PartEstimate(weighted, covariance, sum(part.clusters for part in parts), common)
+
+    def mean(of_parts: Sequence[FloatArray]) -> FloatArray:
+        whole = np.sum([H @ each for H, each in zip(information, of_parts, strict=True)], axis=0)
+        return np.asarray(covariance @ whole)
+
+    common = {name: mean([part.shift(name) for part in parts]) for name in _names(*parts)}
+    clusters = sum(part.clusters for part in parts)
+    return PartEstimate(mean([part.step for part in parts]), covariance, clusters, common)
 
 
-def _padded(common: FloatArray, like: FloatArray) -> FloatArray:
-    """Shifts by errors, 0 for those that only ``like`` has."""
-    return np.pad(common, ((0, 0), (0, max(0, like.shape[1] - common.shape[1]))))
+def _names(*parts: PartEstimate) -> list[str]:
+    """Errors that parts have in common."""
+    return list(dict.fromkeys(name for part in parts for name in part.common))
 
 
 @dataclass(frozen=True)

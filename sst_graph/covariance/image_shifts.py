@@ -13,7 +13,6 @@ adds
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -86,11 +85,10 @@ def shifts_of(table: MatchTable, bread: FloatArray, H: FloatArray, images: IntAr
         table: the matches.
         bread: (s, n) inverse of the information, rows of those unknowns whose covariance is wanted.
         H: (m, 2) derivatives of the residuals by a shift of the picture, weighted [1/px].
-        images: (m,) number of the image, from 0 on.
+        images: (m,) number of the image.
     """
     order = np.argsort(images, kind="stable")
-    bounds = np.searchsorted(images[order], np.arange(images.max() + 2))
-    members = [order[first:end] for first, end in itertools.pairwise(bounds)]
+    members = np.split(order, np.flatnonzero(np.diff(images[order])) + 1)
     # 1. The variance of the shifts.
     r = table.root_weights * table.r
     fits = [_fitted(H[own], r[own], table.sides[own]) for own in members]

@@ -1,4 +1,4 @@
-"""Errors that the estimates of several cameras on one LiDAR have in common, as steps of one of them."""
+"""Errors that several estimates have in common, such as those of cameras on one LiDAR, as steps of each."""
 
 from __future__ import annotations
 
@@ -34,11 +34,20 @@ class SharedErrors:
 
     def cross_covariance(self, other: SharedErrors) -> FloatArray:
         """(7, 7) covariance with another camera's estimate."""
-        cross = spread_covariance(self.samples, other.samples)
-        for name, step in self.common.items():  # a set's order of texts would differ from run to run
-            if name in other.common:
-                cross += np.outer(step, other.common[name])
-        return cross
+        return spread_covariance(self.samples, other.samples) + by_common_errors(self.common, other.common)
+
+
+def by_common_errors(steps: Mapping[str, FloatArray], others: Mapping[str, FloatArray]) -> FloatArray:
+    """(7, 7) covariance of two estimates by the errors that both have.
+
+    Args:
+        steps, others: (7,) of each estimate by one deviation of each error, by its name.
+    """
+    cross = np.zeros((7, 7))
+    for name, step in steps.items():  # a set's order of texts would differ from run to run
+        if name in others:
+            cross += np.outer(step, others[name])
+    return cross
 
 
 def with_estimate(steps: FloatArray) -> NDArray[np.bool_]:

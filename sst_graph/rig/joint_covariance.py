@@ -23,7 +23,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.covariance.shared_errors import SharedErrors
+from sst_graph.covariance.shared_errors import SharedErrors, by_common_errors
 from sst_graph.graph.linear import unit_scale
 from sst_graph.rig.influences import KINDS, UNKNOWNS, CameraInfluences, Influence
 
@@ -92,10 +92,7 @@ def _cross(one: CameraInfluences, other: CameraInfluences, correlations: Mapping
     cross += one.steps_without[a].T @ other.steps_without[b]
     a, b = _common(one.scans, other.scans)
     cross += np.einsum("fij,fkj->ik", one.motion[a], other.motion[b])
-    for name, step in one.assumptions.items():  # a set's order of texts would differ from run to run
-        if name in other.assumptions:
-            cross += np.outer(step, other.assumptions[name])
-    return cross
+    return cross + by_common_errors(one.assumptions, other.assumptions)
 
 
 def _common(one: NDArray[np.int64], other: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -74,8 +74,7 @@ def test_combined_parts_are_weighted_by_their_information() -> None:
 
 def test_what_shifts_both_parts_alike_hides_no_step() -> None:
     """As a principal point that is off does; what shifts one part more than the other counts."""
-    shift, more = np.zeros((7, 1)), np.zeros((7, 1))
-    shift[1], more[1] = 50.0 * SIGMAS[1], 53.0 * SIGMAS[1]
+    shift, more = ({"cy": size * SIGMAS * np.eye(7)[1]} for size in (50.0, 53.0))
     one = replace(part(np.zeros(7)), common=shift)
     step = 8.0 * SIGMAS * np.eye(7)[1]
     alike = Difference.of(one, replace(part(step), common=shift))
@@ -87,9 +86,11 @@ def test_what_shifts_both_parts_alike_hides_no_step() -> None:
 
 
 def test_what_combined_parts_have_in_common_is_weighted_as_they_are() -> None:
-    one = replace(part(np.zeros(7)), common=np.full((7, 2), 1.0))
-    other = replace(part(np.zeros(7), SIGMAS / 2.0), common=np.full((7, 2), 6.0))
-    np.testing.assert_allclose(combined([one, other]).common, 0.2 * 1.0 + 0.8 * 6.0)
+    one = replace(part(np.zeros(7)), common={"cx": np.full(7, 1.0), "k1": np.full(7, 1.0)})
+    other = replace(part(np.zeros(7), SIGMAS / 2.0), common={"cx": np.full(7, 6.0), "k1": np.full(7, 6.0)})
+    common = combined([one, other]).common
+    for name in ("cx", "k1"):
+        np.testing.assert_allclose(common[name], 0.2 * 1.0 + 0.8 * 6.0)
 
 
 @pytest.mark.parametrize(

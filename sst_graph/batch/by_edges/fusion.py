@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from sst_graph.batch.method_estimate import MethodEstimate
 from sst_graph.batch.motion_factor import UNLIKELY_CHI2
+from sst_graph.covariance.shared_errors import by_common_errors
 from sst_graph.graph.state import State, difference
 
 FloatArray = NDArray[np.float64]
@@ -57,7 +58,7 @@ class Fused:
         step = difference(a, state_of(second))
         total = first.covariance + second.covariance
         gain = np.asarray(np.linalg.solve(total, first.covariance).T)
-        cross = _cross_covariance(first, second)
+        cross = by_common_errors(first.assumption_steps, second.assumption_steps)
         chi2 = float(step @ np.linalg.solve(total - cross - cross.T, step))
         moved, rest = gain @ step, np.eye(7) - gain
         covariance = rest @ first.covariance @ rest.T + gain @ second.covariance @ gain.T
@@ -67,13 +68,6 @@ class Fused:
         if chi2 > UNLIKELY_CHI2:
             covariance *= chi2 / 7.0
         return cls(a.moved(moved), 0.5 * (covariance + covariance.T), 2.0 * by_sweeps, step, chi2)
-
-
-def _cross_covariance(first: MethodEstimate, second: MethodEstimate) -> FloatArray:
-    """(7, 7) of the two by the assumptions that both consider."""
-    steps, others = first.assumption_steps, second.assumption_steps
-    cross = [np.outer(step, others[name]) for name, step in steps.items() if name in others]
-    return np.asarray(np.sum([np.zeros((7, 7)), *cross], axis=0), np.float64)
 
 
 def state_of(estimate: MethodEstimate) -> State:
