@@ -6,13 +6,20 @@ The cost of a calibration (cTl, offset), in the tangent space of the linearizati
 
 with d (7,) = [rotation xyz rad, translation xyz m, offset s]: gtsam's ``HessianFactor`` on E (6) and D (1).
 docs/reference/marginal.md shows how a C++ program rebuilds it from the JSON.
+
+A result errs by its own data, and by what it assumes of the sensors (a principal point, a range): with s_i
+the step of its estimate by one deviation of an assumption, its covariance is C = C_own + sum s_i s_i'.
+Another drive's result errs by the same assumptions. So two marginals are added by their own parts, and their
+steps with the same weights: s_i = (L_1 + L_2)^-1 (L_1 s_i1 + L_2 s_i2) with L = C_own^-1. The assumptions are
+considered, not estimated (Schmidt, Application of state-space methods to navigation problems, 1966).
 """
 
 from __future__ import annotations
 
 import json
 import re
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +27,11 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.errors import DataError, EstimationError
+from sst_graph.errors import DataError, EstimationError, count_of
 from sst_graph.factors.arguments import checked_array, checked_gtsam, checked_number, checked_type, described
 from sst_graph.factors.custom.variables import checked_keys
 from sst_graph.factors.errors import FactorError
-from sst_graph.files.checked_values import checked_pose
+from sst_graph.files.checked_values import checked_pose, checked_text
 from sst_graph.files.json_table import JsonTable, json_table
 from sst_graph.files.reading import MARGINAL, parse_json, read_text
 from sst_graph.types import ByValue, Calibration
@@ -46,6 +53,9 @@ SCAN_HASHES = "scan_hashes"
 """Key of the hashes of scans in a marginal's file, and in the diagnostics of a result."""
 MOST_SCAN_HASHES = 32
 """Hashes that a result keeps of its scans."""
+COMMON = "common"
+"""Key of the steps by what a marginal has in common with others, in its file."""
+_MOST_COMMON = 100
 _MOST_FUSED = 1_000_000
 _HASH, _HASHES = re.compile("[0-9a-f]{16}"), "texts of 16 hexadecimal digits"
 
@@ -63,9 +73,12 @@ class CalibrationMarginal(ByValue):
         constant: twice the cost at d = 0.
         scan_hashes: of some of the scans behind it, by which data that are counted twice are found; empty
             where they are not known.
+        common: (7,) step of the optimum by one deviation of each error that marginals of the same sensors
+            have, too, by its name; the information holds them.
 
     Raises:
-        FactorError: other types or shapes, values NaN or inf, or an information that is not symmetric.
+        FactorError: other types or shapes, values NaN or inf, an information that is not symmetric, or steps
+            that are larger than its covariance.
         DataError: a pose whose rotation is none.
     """
 
@@ -75,6 +88,7 @@ class CalibrationMarginal(ByValue):
     vector: FloatArray
     constant: float = 0.0
     scan_hashes: tuple[str, ...] = ()
+    common: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         of = "of CalibrationMarginal"
@@ -89,9 +103,12 @@ class CalibrationMarginal(ByValue):
             "vector": checked_array(f"vector {of}", self.vector, (7,)),
             "constant": checked_number(f"constant {of}", self.constant),
             "scan_hashes": _checked_hashes(f"scan_hashes {of}", self.scan_hashes),
+            "common": _checked_steps(f"common {of}", self.common),
         }
         for name, value in plain.items():
             object.__setattr__(self, name, value)
+        if self.common and own_covariance(self.covariance(), self.common) is None:
+            raise FactorError(f"common {of}", "steps past its covariance", "a part of it")
 
     def factor(self, E_key: int = EXTRINSIC, D_key: int = TIME_OFFSET) -> gtsam.LinearContainerFactor:
         """The cost as a factor on the given keys; it pickles and serializes, and needs gtsam only.
@@ -139,9 +156,12 @@ class CalibrationMarginal(ByValue):
         """Both costs together, at this one's linearization point; exact where the two share it.
 
         Raises:
+            EstimationError: the two have errors in common, and leave a direction without information.
             FactorError: something else than a marginal.
         """
         checked_type("a marginal plus another", other, CalibrationMarginal, "a CalibrationMarginal")
+        if self.common or other.common:
+            return replace(self, **vars(separated(self).plus(separated(other)).together()))
         there = other if self.shares_point(other) else carried(other, self.cTl, self.time_offset_s)
         return replace(
             self,
@@ -182,6 +202,8 @@ class CalibrationMarginal(ByValue):
         }
         if self.scan_hashes:
             document[SCAN_HASHES] = list(self.scan_hashes)
+        if self.common:
+            document[COMMON] = {name: step.tolist() for name, step in self.common.items()}
         return _dump(document)
 
     @staticmethod
@@ -193,7 +215,7 @@ class CalibrationMarginal(ByValue):
         """
         table = json_table(parse_json(text, place, MARGINAL.name), place, FORMAT, VERSION)
         point = table.table("linearization_point")
-        return CalibrationMarginal(
+        without = CalibrationMarginal(
             point.pose("T_camera_lidar"),
             point.time_offset_s("time_offset_s"),
             _information(table),
@@ -201,6 +223,114 @@ class CalibrationMarginal(ByValue):
             float(_bounded(table, "constant", np.array(table.number("constant")))),
             hashes_in(table),
         )
+        try:
+            return replace(without, common=steps_in(table))
+        except (EstimationError, FactorError) as error:
+            place = f"{table.place}: {COMMON}"
+            raise DataError(place, str(error), "steps that the information holds") from None
+
+
+@dataclass(frozen=True, eq=False)
+class Separated:
+    """A marginal by its own data alone, and what it has in common with others apart from it.
+
+    Attributes:
+        own: the marginal without the common errors.
+        common: (7,) step of its optimum by one deviation of each, by name.
+    """
+
+    own: CalibrationMarginal
+    common: Mapping[str, FloatArray]
+
+    def carried(self, cTl: gtsam.Pose3, time_offset_s: float) -> Separated:
+        """The same about another point."""
+        _, J = _moved(self.own, cTl, time_offset_s)
+        return Separated(carried(self.own, cTl, time_offset_s), _steps_there(self.common, J))
+
+    def plus(self, other: Separated) -> Separated:
+        """Both together, at this one's point.
+
+        Raises:
+            EstimationError: errors in common, and a direction without information.
+        """
+        if not self.own.shares_point(other.own):
+            other = other.carried(self.own.cTl, self.own.time_offset_s)
+        return Separated(self.own.plus(other.own), weighted_steps([self, other]))
+
+    def covariance(self) -> FloatArray:
+        """(7, 7) with the common errors.
+
+        Raises:
+            EstimationError: a direction without information.
+        """
+        return self.own.covariance() + _covariance_by(self.common)
+
+    def together(self) -> CalibrationMarginal:
+        """As one marginal, with the same optimum and the same least cost.
+
+        Raises:
+            EstimationError: errors in common, and a direction without information.
+        """
+        if not self.common:
+            return self.own
+        information = inverse(self.covariance(), "covariance of a marginal")
+        return replace(_with_information(self.own, information), common=self.common)
+
+
+def separated(marginal: CalibrationMarginal) -> Separated:
+    """A marginal by its own data, and its common errors apart.
+
+    Raises:
+        EstimationError: errors in common, and a direction without information.
+    """
+    if not marginal.common:
+        return Separated(marginal, {})
+    own = own_covariance(marginal.covariance(), marginal.common)
+    assert own is not None  # the marginal has seen to it
+    information = inverse(own, "own covariance of a marginal")
+    return Separated(_with_information(marginal, information), marginal.common)
+
+
+def weighted_steps(parts: Sequence[Separated]) -> dict[str, FloatArray]:
+    """(7,) step of the optimum of several marginals about one point together, by each error of theirs.
+
+    Raises:
+        EstimationError: errors in common, and a direction without information.
+    """
+    names = dict.fromkeys(name for part in parts for name in part.common)
+    if not names:
+        return {}
+    covariance = inverse(sum((part.own.information for part in parts), np.zeros((7, 7))), "information")
+    return {
+        name: covariance
+        @ sum((part.own.information @ part.common.get(name, np.zeros(7)) for part in parts), np.zeros(7))
+        for name in names
+    }
+
+
+def own_covariance(covariance: FloatArray, common: Mapping[str, FloatArray]) -> FloatArray | None:
+    """(7, 7) part of a covariance without common errors, or None where that is none."""
+    own = covariance - _covariance_by(common)
+    scale = 1.0 / np.sqrt(np.diag(covariance))
+    return own if np.linalg.eigvalsh(own * np.outer(scale, scale))[0] > _LEAST_OWN else None
+
+
+_LEAST_OWN = 1e-9
+"""Least share of a variance that is a marginal's own: rounding takes less."""
+
+
+def _covariance_by(common: Mapping[str, FloatArray]) -> FloatArray:
+    steps = np.reshape([*common.values()], (-1, 7))
+    return np.asarray(steps.T @ steps)
+
+
+def _with_information(marginal: CalibrationMarginal, information: FloatArray) -> CalibrationMarginal:
+    """The cost with the same optimum and least cost, and another information; without common errors."""
+    d = marginal.covariance() @ marginal.vector
+    vector = information @ d
+    constant = marginal.constant - float(marginal.vector @ d) + float(vector @ d)
+    point = marginal.cTl, marginal.time_offset_s
+    return CalibrationMarginal(*point, information, vector, constant, marginal.scan_hashes)
 
 
 def marginal_keys(E_key: Any, D_key: Any) -> tuple[int, int]:
@@ -232,6 +362,26 @@ def hashes_in(table: JsonTable) -> tuple[str, ...]:
     if len(found) > _MOST_FUSED or not all(map(_is_hash, found)):
         raise DataError(f"{table.place}: {SCAN_HASHES}", "something else", _HASHES)
     return tuple(found)
+
+
+def steps_in(table: JsonTable) -> dict[str, FloatArray]:
+    """The steps by common errors in a file; none in one that does not have them.
+
+    Raises:
+        DataError: something else.
+    """
+    found = table.mapping(COMMON) if COMMON in table.data else {}
+    if len(found) > _MOST_COMMON:
+        raise DataError(f"{table.place}: {COMMON}", count_of(len(found), "step"), f"at most {_MOST_COMMON}")
+    inner = JsonTable(found, f"{table.place}: {COMMON}")
+    return {checked_text(name, inner.place): inner.matrix(name, (7,)) for name in found}
+
+
+def _checked_steps(what: str, value: Any) -> dict[str, FloatArray]:
+    checked_type(what, value, Mapping, "steps (7,) by name")
+    for name in value:
+        checked_type(what, name, str, "steps (7,) by name")
+    return {name: checked_array(f"{name} of {what}", step, (7,)) for name, step in value.items()}
 
 
 def _checked_hashes(what: str, value: Any) -> tuple[str, ...]:
@@ -290,13 +440,27 @@ def _symmetric(unit: FloatArray) -> bool:
 def carried(marginal: CalibrationMarginal, cTl: gtsam.Pose3, time_offset_s: float) -> CalibrationMarginal:
     """The same cost, expanded about another point: d_0 = shift + J d, J the derivative of Log(T0^-1 T
     Exp(d))."""
-    J = np.eye(7)
-    step, J[:6, :6] = _log(marginal.cTl.between(cTl))
-    shift = np.append(step, time_offset_s - marginal.time_offset_s)
+    shift, J = _moved(marginal, cTl, time_offset_s)
     L, g = marginal.information, marginal.vector
     constant = marginal.constant - 2.0 * float(g @ shift) + float(shift @ L @ shift)
-    vector = J.T @ (g - L @ shift)
-    return CalibrationMarginal(cTl, time_offset_s, J.T @ L @ J, vector, constant, marginal.scan_hashes)
+    vector, common = J.T @ (g - L @ shift), _steps_there(marginal.common, J)
+    return CalibrationMarginal(
+        cTl, time_offset_s, J.T @ L @ J, vector, constant, marginal.scan_hashes, common
+    )
+
+
+def _steps_there(common: Mapping[str, FloatArray], J: FloatArray) -> dict[str, FloatArray]:
+    """Steps about the point from which J leads."""
+    return {name: np.asarray(np.linalg.solve(J, step)) for name, step in common.items()}
+
+
+def _moved(
+    marginal: CalibrationMarginal, cTl: gtsam.Pose3, time_offset_s: float
+) -> tuple[FloatArray, FloatArray]:
+    """Shift (7,) and J (7, 7) of d_0 = shift + J d, from a marginal's point to another."""
+    J = np.eye(7)
+    step, J[:6, :6] = _log(marginal.cTl.between(cTl))
+    return np.append(step, time_offset_s - marginal.time_offset_s), J
 
 
 def _log(pose: gtsam.Pose3) -> tuple[FloatArray, FloatArray]:

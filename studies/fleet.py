@@ -280,7 +280,7 @@ def empty_drive(job: Job) -> Record:
     sigmas = np.array([2e-3] * 3 + [0.02] * 3 + [0.005])
     cTl = NOMINAL_CTL.retract(rng.normal(size=6) * sigmas[:6])
     numbers = Numbers(
-        cTl.matrix().tolist(), float(rng.normal() * 0.005), np.diag(sigmas**2).tolist(), [], 8, "c"
+        cTl.matrix().tolist(), float(rng.normal() * 0.005), np.diag(sigmas**2).tolist(), {}, 8, "c"
     )
     record = Record(job.drive.name, job.drive.place.url, "ok", "", Cost(1, 1.0, 1.0, 10**8, 10**6), numbers)
     folder = job.result.path

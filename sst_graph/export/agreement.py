@@ -12,7 +12,7 @@ from scipy.special import chdtrc
 from sst_graph.covariance.contradiction import Difference, PartEstimate, combined, name_step
 from sst_graph.errors import ContradictionError, EstimationError, count_of
 from sst_graph.graph.linear import unit_scale
-from sst_graph.marginal import CalibrationMarginal
+from sst_graph.marginal import CalibrationMarginal, Separated
 
 FloatArray = NDArray[np.float64]
 
@@ -25,15 +25,16 @@ _FAR_SIGMA = 1e3
 
 
 def check_agreement(
-    parts: Sequence[tuple[FloatArray, FloatArray]],
+    parts: Sequence[Separated],
     cTl: gtsam.Pose3,
     names: Sequence[str] = (),
     significance: float = SIGNIFICANCE,
 ) -> None:
-    """That quadratic costs about one point agree, each with the others and all together.
+    """That marginals about one point agree, each with the others and all together.
 
     Args:
-        parts: (7, 7) information and (7,) vector of each.
+        parts: the marginals; what they have in common explains differences between them only as far as it
+            moves them differently.
         cTl: the point's extrinsic, for the words.
         names: of the parts; numbers from 0 where none are given.
         significance: probability of an error where they agree; 0 checks nothing.
@@ -44,13 +45,10 @@ def check_agreement(
     """
     if len(parts) < 2 or significance <= 0.0:
         return
-    _check_answers([information for information, _ in parts], names)
-    estimates = [_estimate(information, vector) for information, vector in parts]
+    _check_answers([part.own.information for part in parts], names)
+    estimates = [_estimate(part) for part in parts]
     # 1. All together: how much the costs are above their own minima, for 7 numbers a part more than needed.
-    common = combined(estimates)
-    away = [part.step - common.step for part in estimates]
-    chi2 = float(sum(d @ information @ d for d, (information, _) in zip(away, parts, strict=True)))
-    freedom = 7 * (len(parts) - 1)
+    chi2, freedom = _disagreement(parts, estimates), 7 * (len(parts) - 1)
     # 2. Each against the others.
     against = [
         Difference.of(combined([*estimates[:k], *estimates[k + 1 :]]), part)
@@ -103,7 +101,25 @@ def _check_answers(informations: Sequence[FloatArray], names: Sequence[str]) -> 
             )
 
 
-def _estimate(information: FloatArray, vector: FloatArray) -> PartEstimate:
-    """A cost's own optimum; a direction that it does not determine has a large variance."""
-    covariance = np.asarray(np.linalg.inv(information + np.eye(7) / _FAR_SIGMA**2), np.float64)
-    return PartEstimate(covariance @ vector, covariance)
+def _estimate(part: Separated) -> PartEstimate:
+    """A marginal's own optimum; a direction that it does not determine has a large variance."""
+    covariance = np.asarray(np.linalg.inv(part.own.information + np.eye(7) / _FAR_SIGMA**2), np.float64)
+    return PartEstimate(covariance @ part.own.vector, covariance, common=part.common)
+
+
+def _disagreement(parts: Sequence[Separated], estimates: Sequence[PartEstimate]) -> float:
+    """Chi-squared of all estimates d_k = x + S_k a + own error, with common errors a of one deviation each.
+
+    The least over x and a of sum (d_k - x - S_k a)' L_k (d_k - x - S_k a) + a' a.
+    """
+    names = list(dict.fromkeys(name for part in parts for name in part.common))
+    around = combined(estimates).step
+    H = np.diag([0.0] * 7 + [1.0] * len(names))
+    g, constant = np.zeros(len(H)), 0.0
+    for part, estimate in zip(parts, estimates, strict=True):
+        J = np.column_stack([np.eye(7), *(estimate.shift(name) for name in names)])
+        d, L = estimate.step - around, part.own.information
+        H, g, constant = H + J.T @ L @ J, g + J.T @ L @ d, constant + float(d @ L @ d)
+    scale = unit_scale(H)
+    least = np.linalg.lstsq(H * np.outer(scale, scale), g * scale, rcond=None)[0]
+    return constant - float(g @ (scale * least))

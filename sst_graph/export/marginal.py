@@ -27,8 +27,12 @@ from sst_graph.marginal import (
     TIME_OFFSET,
     VERSION,
     CalibrationMarginal,
+    Separated,
     marginal_keys,
+    own_covariance,
     read_marginal,
+    separated,
+    weighted_steps,
 )
 from sst_graph.marginal import carried as _carried
 from sst_graph.marginal import inverse as _inverse
@@ -42,6 +46,7 @@ __all__ = [
     "TIME_OFFSET",
     "VERSION",
     "CalibrationMarginal",
+    "common_steps",
     "fuse_graphs",
     "fuse_marginals",
     "marginal_of_graph",
@@ -56,6 +61,7 @@ def marginal_of_result(result: CalibrationResult) -> CalibrationMarginal:
     """The marginal of a calibration: its estimate, with the inverse of its cluster-robust covariance.
 
     Not the frozen graph's Hessian, which takes neighbouring matches for independent and is far too sure.
+    What the result's assumptions may be wrong by is known to be common to all results of these sensors.
     A direction that the data do not determine has a large, finite sigma in the result and so next to no
     information here.
 
@@ -65,10 +71,28 @@ def marginal_of_result(result: CalibrationResult) -> CalibrationMarginal:
     """
     checked_type("result", result, CalibrationResult, "a CalibrationResult")
     information = _inverse(result.covariance, "covariance of the result")
-    hashes = result.diagnostics.get(SCAN_HASHES, ())
+    hashes, common = result.diagnostics.get(SCAN_HASHES, ()), common_steps(result)
     return CalibrationMarginal(
-        result.T_camera_lidar, result.time_offset_s, information, np.zeros(7), scan_hashes=hashes
+        result.T_camera_lidar, result.time_offset_s, information, np.zeros(7), 0.0, hashes, common
     )
+
+
+def common_steps(result: CalibrationResult) -> dict[str, FloatArray]:
+    """(7,) step of a result by one deviation of each assumption that its covariance holds, by name.
+
+    All results of the same two sensors err by these together. Empty where the covariance does not hold them,
+    such as one that a program has put in its place.
+    """
+    entries = result.diagnostics.get("assumptions")
+    steps = {}
+    for name, entry in entries.items() if isinstance(entries, dict) else ():
+        try:
+            step = float(entry["sigma"]) * np.asarray(entry["sensitivity"], np.float64)
+        except (KeyError, TypeError, ValueError):
+            continue
+        if step.shape == (7,) and np.isfinite(step).all() and step.any():
+            steps[name] = step
+    return {} if own_covariance(result.covariance, steps) is None else steps
 
 
 def marginal_of_graph(
@@ -229,7 +253,8 @@ def fuse_marginals(
     Exact where all marginals share their linearization point. Otherwise each is expanded about the common
     point by its first derivative, which holds while the points differ by little (a degree, a decimetre). By
     how much the sum of the costs at their common optimum exceeds the sum of their own minima is a
-    chi-squared, and so is what each differs from the others by: both are tested.
+    chi-squared, and so is what each differs from the others by: both are tested. Errors that the marginals
+    have in common (:attr:`CalibrationMarginal.common`) do not average out, and hide no contradiction.
 
     Args:
         names: of the marginals, for the error; numbers from 0 where none are given.
@@ -254,15 +279,17 @@ def fuse_marginals(
     if significance > 0.0:
         check_apart(marginals, names)
     fused = marginals[0]
+    separate = [separated(marginal) for marginal in marginals]
     for _ in range(_MAX_ROUNDS):
-        parts = [_carried(marginal, fused.cTl, fused.time_offset_s) for marginal in marginals]
+        parts = [one.carried(fused.cTl, fused.time_offset_s) for one in separate]
+        owns = [part.own for part in parts]
         total = CalibrationMarginal(
             fused.cTl,
             fused.time_offset_s,
-            sum((part.information for part in parts), np.zeros((7, 7))),
-            sum((part.vector for part in parts), np.zeros(7)),
-            sum(part.constant for part in parts),
-            tuple(sorted({one for part in parts for one in part.scan_hashes})),
+            sum((own.information for own in owns), np.zeros((7, 7))),
+            sum((own.vector for own in owns), np.zeros(7)),
+            sum(own.constant for own in owns),
+            tuple(sorted({one for own in owns for one in own.scan_hashes})),
         )
         step = total.covariance() @ total.vector
         fused = _carried(total, *total.best())
@@ -272,8 +299,9 @@ def fuse_marginals(
         raise EstimationError(
             f"fusion of {count_of(len(marginals), 'marginal')}: still moving after {_MAX_ROUNDS} rounds"
         )
-    check_agreement([(part.information, part.vector) for part in parts], fused.cTl, names, significance)
-    return fused
+    check_agreement(parts, fused.cTl, names, significance)
+    common = weighted_steps([one.carried(fused.cTl, fused.time_offset_s) for one in separate])
+    return Separated(fused, common).together()
 
 
 _MAX_ROUNDS, _STANDSTILL_SIGMAS = 50, 1e-6

@@ -4,24 +4,25 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError, printable
+from sst_graph.export import common_steps
 from sst_graph.files.json_table import json_table
 from sst_graph.files.reading import FileKind, parse_json
 from sst_graph.files.strict_json import strict_json
 from sst_graph.inspect.reasons import short_reasons
-from sst_graph.marginal import SCAN_HASHES, CalibrationMarginal, hashes_in, inverse
+from sst_graph.marginal import SCAN_HASHES, CalibrationMarginal, hashes_in, inverse, steps_in
 from sst_graph.result import CalibrationResult
 
 FloatArray = NDArray[np.float64]
 
 FORMAT = "sst-graph/batch-record"
-VERSION = 1
+VERSION = 2
 RECORD = FileKind("a record of a batch", 1024 * 1024)
 
 Status = Literal[
@@ -80,7 +81,7 @@ class Numbers:
         T_camera_lidar: 4 rows of 4.
         time_offset_s: [s].
         covariance: 7 rows of 7.
-        common: columns of 7, one an assumption: what its deviation (one sigma) shifts the result by.
+        common: 7 numbers for each assumption, by its name: what one deviation of it shifts the result by.
         frames: how many took part.
         camera: name of the camera.
         scan_hashes: of some of its scans.
@@ -89,7 +90,7 @@ class Numbers:
     T_camera_lidar: list[list[float]]
     time_offset_s: float
     covariance: list[list[float]]
-    common: list[list[float]]
+    common: dict[str, list[float]]
     frames: int
     camera: str
     scan_hashes: tuple[str, ...] = ()
@@ -101,7 +102,7 @@ class Numbers:
             result.T_camera_lidar.matrix().tolist(),
             result.time_offset_s,
             result.covariance.tolist(),
-            _common(result.diagnostics.get("assumptions")),
+            {name: step.tolist() for name, step in common_steps(result).items()},
             len(result.frames_used),
             result.camera_name,
             tuple(result.diagnostics.get(SCAN_HASHES, ())),
@@ -120,8 +121,9 @@ class Numbers:
         """
         information = inverse(np.array(self.covariance), "covariance of the result")
         cTl = gtsam.Pose3(np.array(self.T_camera_lidar))
+        common = {name: np.array(step) for name, step in self.common.items()}
         return CalibrationMarginal(
-            cTl, self.time_offset_s, information, np.zeros(7), scan_hashes=self.scan_hashes
+            cTl, self.time_offset_s, information, np.zeros(7), 0.0, self.scan_hashes, common
         )
 
 
@@ -179,9 +181,7 @@ class Record:
                 read.pose("T_camera_lidar").matrix().tolist(),
                 read.time_offset_s("time_offset_s"),
                 read.matrix("covariance", (7, 7)).tolist(),
-                read.matrix("common", (len(read.sequence("common")), 7)).tolist()
-                if read.value("common")
-                else [],
+                {name: step.tolist() for name, step in steps_in(read).items()},
                 read.integer("frames"),
                 read.text("camera"),
                 hashes_in(read),
@@ -210,19 +210,6 @@ def reason_of(result: CalibrationResult) -> str:
         return ""
     first, *others = short_reasons(result) or ("the result carries no reason",)
     return printable(first + (f" ({len(others)} more in its report)" if others else ""), 1000)
-
-
-def _common(assumptions: Any) -> list[list[float]]:
-    """Shift of the result by one sigma of each assumption's parameter that was considered."""
-    columns = []
-    for entry in assumptions.values() if isinstance(assumptions, dict) else ():
-        try:
-            column = float(entry["sigma"]) * np.asarray(entry["sensitivity"], np.float64)
-        except (KeyError, TypeError, ValueError):
-            continue
-        if column.shape == (7,) and np.isfinite(column).all():
-            columns.append(column.tolist())
-    return columns
 
 
 def _text(data: bytes, place: str | Path) -> str:

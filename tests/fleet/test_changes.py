@@ -8,6 +8,7 @@ from fleet.vehicle_drives import step, vehicle
 
 from sst_graph.fleet.vehicles.changes import find_changes
 from sst_graph.fleet.vehicles.walk import WalkConfig
+from studies.small_changes import apart, is_found, shuffled, stepped
 
 CONFIG = WalkConfig()
 
@@ -83,3 +84,30 @@ def test_false_alarms_are_as_rare_as_stated() -> None:
     rng = np.random.default_rng(9)
     found = [find_changes(vehicle(rng, {}, count=6), often) for _ in range(60)]
     assert sum(bool(one.steps or one.contradicting) for one in found) <= 8
+
+
+LENS = {"cx": step(yaw_deg=0.5), "cy": step(pitch_deg=0.4)}
+
+
+def test_a_lens_that_is_off_is_no_change_and_hides_none() -> None:
+    often, rng = WalkConfig(false_alarm_rate=0.05), np.random.default_rng(10)
+    found = [find_changes(vehicle(rng, {}, count=6, lens=LENS), often) for _ in range(40)]
+    assert sum(bool(one.steps or one.contradicting) for one in found) <= 6
+    small = {4: step(yaw_deg=0.5)}
+    (at,) = find_changes(vehicle(np.random.default_rng(11), small, lens=LENS), CONFIG).steps
+    assert at == 4
+    drives = vehicle(np.random.default_rng(11), small, lens=LENS)
+    assert not find_changes(apart(drives), CONFIG).steps  # errors of that size, were they each drive's own
+
+
+def test_steps_of_the_study_are_found_where_they_are() -> None:
+    drives = vehicle(np.random.default_rng(12), {}, lens=LENS)
+    moved = stepped(drives, 5, step(yaw_deg=1.0))
+    assert is_found(find_changes(moved, CONFIG), 5, moved) and not is_found(
+        find_changes(moved, CONFIG), 2, moved
+    )
+    (at,) = find_changes(apart(stepped(drives, 5, step(yaw_deg=3.0))), CONFIG).steps
+    assert at == 5
+    again = shuffled(drives, np.random.default_rng(13))
+    assert [one.day for one in again] == [one.day for one in drives]
+    assert {one.name for one in again} == {one.name for one in drives}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +25,7 @@ def vehicle(
     wrong: dict[int, FloatArray] | None = None,
     count: int = 8,
     config: WalkConfig | None = None,
+    lens: Mapping[str, FloatArray] | None = None,
 ) -> list[DriveEstimate]:
     """One drive a week.
 
@@ -30,12 +33,15 @@ def vehicle(
         steps: (7,) by the number of the first drive after it.
         wrong: (7,) error of single drives beyond what they claim.
         config: of the true random walk.
+        lens: (7,) step of every drive by one deviation of each error that all have in common.
     """
     config = WalkConfig() if config is None else config
     rates = np.repeat(
         [np.radians(config.rotation_deg), config.translation_m, config.time_offset_s], [3, 3, 1]
     )
     cTl, time_offset_s = RIG, 0.02
+    lens = {} if lens is None else lens
+    shift = sum((rng.normal() * step for step in lens.values()), np.zeros(7))
     drives = []
     for k in range(count):
         way = rng.normal(size=7) * rates * np.sqrt(WEEK) if k else np.zeros(7)
@@ -43,9 +49,10 @@ def vehicle(
         cTl, time_offset_s = cTl.retract(way[:6]), time_offset_s + way[6]
         mixing = (np.eye(7) + 0.3 * rng.normal(size=(7, 7))) * SIGMAS[:, None]
         covariance = rng.uniform(0.5, 3.0) * mixing @ mixing.T
-        error = rng.multivariate_normal(np.zeros(7), covariance) + (wrong or {}).get(k, np.zeros(7))
+        error = rng.multivariate_normal(np.zeros(7), covariance) + (wrong or {}).get(k, np.zeros(7)) + shift
+        information = np.linalg.inv(covariance + sum(np.outer(s, s) for s in lens.values()))
         marginal = CalibrationMarginal(
-            cTl.retract(error[:6]), time_offset_s + error[6], np.linalg.inv(covariance), np.zeros(7)
+            cTl.retract(error[:6]), time_offset_s + error[6], information, np.zeros(7), common=lens
         )
         drives.append(DriveEstimate(f"drive_{k}", WEEK * k, marginal))
     return drives

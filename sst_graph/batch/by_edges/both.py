@@ -163,13 +163,30 @@ def _of_both_parts(labels: MethodEstimate, edges: MethodEstimate) -> MethodEstim
         reasons=(*_contradiction(fused), *(sweeps if (shares > MATTERS**2).any() else ())),
         remarks=(*labels.remarks, *edges.remarks),
         by_static_objects=static,
-        diagnostics={**diagnostics, "edges": dict(edges.diagnostics), "both": facts},
+        diagnostics=diagnostics
+        | {
+            "assumptions": _assumptions(fused, labels, edges),
+            "edges": dict(edges.diagnostics),
+            "both": facts,
+        },
         solved=None,
+        assumption_steps=fused.assumption_steps,
         # Of convergence and likelihood each part has its own, about another estimate than this.
         fit=_fit_at(fused.state, labels),
         edges_fit=_fit_at(fused.state, edges),
         matched=None,
     )
+
+
+def _assumptions(fused: Fused, labels: MethodEstimate, edges: MethodEstimate) -> dict[str, Any]:
+    """What the parts say of the assumptions, with the sensitivities of the fused estimate."""
+    said = {**edges.diagnostics.get("assumptions", {}), **labels.diagnostics.get("assumptions", {})}
+    return {
+        name: {**entry, "sensitivity": (fused.assumption_steps[name] / entry["sigma"]).tolist()}
+        if name in fused.assumption_steps and entry["sigma"] > 0.0
+        else entry
+        for name, entry in said.items()
+    }
 
 
 def _contradiction(fused: Fused) -> tuple[str, ...]:

@@ -15,6 +15,7 @@ of x_2 - x_1 shrinks by X + X'.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import gtsam
@@ -39,6 +40,7 @@ class Fused:
         by_sweeps: (7, 7) part of it by sweeps that the scans leave undecided.
         step: (7,) from the first to the second.
         chi2: of 7, of that step under its covariance.
+        assumption_steps: (7,) step by one deviation of each assumption, by name.
     """
 
     state: State
@@ -46,6 +48,7 @@ class Fused:
     by_sweeps: FloatArray
     step: FloatArray
     chi2: float
+    assumption_steps: Mapping[str, FloatArray]
 
     @classmethod
     def of(cls, first: MethodEstimate, second: MethodEstimate) -> Fused:
@@ -67,7 +70,13 @@ class Fused:
         covariance += by_sweeps
         if chi2 > UNLIKELY_CHI2:
             covariance *= chi2 / 7.0
-        return cls(a.moved(moved), 0.5 * (covariance + covariance.T), 2.0 * by_sweeps, step, chi2)
+        covariance = 0.5 * (covariance + covariance.T)
+        none, known = np.zeros(7), (first.assumption_steps, second.assumption_steps)
+        steps = {
+            name: rest @ known[0].get(name, none) + gain @ known[1].get(name, none)
+            for name in dict.fromkeys((*known[0], *known[1]))
+        }
+        return cls(a.moved(moved), covariance, 2.0 * by_sweeps, step, chi2, steps)
 
 
 def state_of(estimate: MethodEstimate) -> State:

@@ -6,6 +6,9 @@ seven unknowns and so with one chi-squared of 7 degrees of freedom, whatever the
 - a step between two consecutive drives: the drives before it against those after it;
 - a drive that contradicts: that drive against all others of its stretch.
 
+An assumption that is off, such as a principal point, moves all drives of a vehicle nearly alike: it explains
+a difference between two sides only as far as it moves them differently.
+
 The least likely one is taken if its probability, times the number of hypotheses, is below the false-alarm
 rate; then the rest is tested with that one in place, until nothing is left. A step before the last drive and
 a last drive that contradicts are one and the same in the data: it is called a change with one drive on a
@@ -21,7 +24,7 @@ import gtsam
 
 from sst_graph.covariance.contradiction import Difference, PartEstimate, name_step
 from sst_graph.fleet.vehicles.walk import DriveEstimate, Passes, WalkConfig, passes
-from sst_graph.marginal import CalibrationMarginal, carried
+from sst_graph.marginal import Separated, separated
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,16 +124,16 @@ def _alone(ways: Passes, left: Sequence[DriveEstimate], k: int, hypotheses: int)
         others = later if earlier is None else earlier
     else:
         others = earlier.plus(later)
-    return None if others is None else _compared(others, left[k].marginal, hypotheses)
+    return None if others is None else _compared(others, separated(left[k].marginal), hypotheses)
 
 
-def _compared(one: CalibrationMarginal, other: CalibrationMarginal, hypotheses: int) -> Finding:
-    cTl, time_offset_s = one.best()
+def _compared(one: Separated, other: Separated, hypotheses: int) -> Finding:
+    cTl, time_offset_s = one.own.best()
     parts = []
-    for marginal in (one, other):
-        there = carried(marginal, cTl, time_offset_s)
-        covariance = there.covariance()
-        parts.append(PartEstimate(covariance @ there.vector, covariance))
+    for separate in (one, other):
+        there = separate.carried(cTl, time_offset_s)
+        covariance = there.own.covariance()
+        parts.append(PartEstimate(covariance @ there.own.vector, covariance, common=there.common))
     difference = Difference.of(parts[0], parts[1])
     return Finding(difference, cTl, min(1.0, hypotheses * difference.p_value))
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import EstimationError
-from sst_graph.export import fuse_marginals
+from sst_graph.factors.errors import FactorError
 from sst_graph.files.strict_json import strict_json
 from sst_graph.fleet.drives import Drive
 from sst_graph.fleet.record import Numbers, Record
@@ -118,10 +118,8 @@ def vehicle_of(
     drift = smoothed(found.left, found.steps, config)
     by_name = {drive.name: drive for drive in counted}
     changes = _changes(found, by_name)
-    last = found.left[max(found.steps, default=0) :]
-    common = _common_covariance(last, [_numbers(records, one.name) for one in last])
-    at_last = drift[-1]
-    calibration = Smoothed(at_last.cTl, at_last.time_offset_s, at_last.covariance + common)
+    last = drift[-1]
+    calibration = Smoothed(last.cTl, last.time_offset_s, last.covariance + last.common)
     status: VehicleStatus = "changed" if changes else "contradicted" if found.contradicting else "ok"
     return Vehicle(
         name,
@@ -224,7 +222,7 @@ def _counted(drives: Sequence[Drive], records: Mapping[str, Record]) -> tuple[li
             hashes = record.numbers.scan_hashes
             try:
                 record.numbers.marginal()
-            except EstimationError as error:
+            except (EstimationError, FactorError) as error:
                 without[drive.name] = str(error)
                 continue
             if twin := next((owners[one] for one in hashes if one in owners), None):
@@ -253,23 +251,3 @@ def _changes(found: Findings, drives: Mapping[str, Drive]) -> tuple[Change, ...]
         )
         for k in sorted(found.steps)
     )
-
-
-def _common_covariance(drives: Sequence[DriveEstimate], numbers: Sequence[Numbers]) -> FloatArray:
-    """(7, 7) what the covariance of the fused drives lacks where their assumptions err together.
-
-    Each result's covariance holds the shift s of its estimate by one sigma of each assumption (the lens, the
-    principal point, ...), as if it were its own. The sensors are the same in all drives, so with weights W_k
-    the fused estimate is shifted by sum W_k s_k, where independent shifts would give sum W_k s_k s_k' W_k'.
-    """
-    fused = fuse_marginals([one.marginal for one in drives], significance=0.0)
-    covariance, extra = fused.covariance(), np.zeros((7, 7))
-    assumptions = min(len(one.common) for one in numbers)
-    for i in range(assumptions):
-        shifts = [
-            covariance @ one.marginal.information @ np.array(own.common[i])
-            for one, own in zip(drives, numbers, strict=True)
-        ]
-        together = np.sum(shifts, axis=0)
-        extra += np.outer(together, together) - sum(np.outer(shift, shift) for shift in shifts)
-    return np.asarray(extra)

@@ -5,13 +5,15 @@ factor (:func:`sst_graph.export.marginal_of_result`). Consecutive drives are tie
 (:func:`sst_graph.factors.extrinsic_drift`, :func:`sst_graph.factors.time_offset_drift`) over the days
 between them. Where a step is, that tie is left out. The chain is solved by eliminating each drive's variables
 in turn, once forward and once back: the two marginals at a drive together are the smoothed one, and each
-alone is what a step is tested with.
+alone is what a step is tested with. What the drives have in common (the assumptions about their sensors) is
+carried along apart from their own errors, with the same weights.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -20,7 +22,7 @@ from numpy.typing import NDArray
 from sst_graph.config import Settings, setting
 from sst_graph.export import EXTRINSIC, TIME_OFFSET, CalibrationMarginal, marginal_of_graph
 from sst_graph.factors import extrinsic_drift, time_offset_drift
-from sst_graph.marginal import carried
+from sst_graph.marginal import Separated, separated
 
 FloatArray = NDArray[np.float64]
 
@@ -67,12 +69,15 @@ class Smoothed:
 
     Attributes:
         cTl, time_offset_s: the estimate.
-        covariance: (7, 7) right perturbation, order of the conventions.
+        covariance: (7, 7) right perturbation, order of the conventions: that of differences from drive to
+            drive, without what all drives have in common.
+        common: (7, 7) covariance by that.
     """
 
     cTl: gtsam.Pose3
     time_offset_s: float
     covariance: FloatArray
+    common: FloatArray = field(default_factory=lambda: np.zeros((7, 7)))
 
 
 def smoothed(drives: Sequence[DriveEstimate], steps: Collection[int], config: WalkConfig) -> list[Smoothed]:
@@ -89,8 +94,8 @@ def smoothed(drives: Sequence[DriveEstimate], steps: Collection[int], config: Wa
     found = []
     for upto, after in zip(ways.upto, ways.after, strict=True):
         both = upto if after is None else upto.plus(after)
-        best = both.best()
-        found.append(Smoothed(best.cTl, best.time_offset_s, both.covariance()))
+        best, covariance = both.own.best(), both.own.covariance()
+        found.append(Smoothed(best.cTl, best.time_offset_s, covariance, both.covariance() - covariance))
     return found
 
 
@@ -104,32 +109,36 @@ class Passes:
         upto: for each drive, itself with ``before``; since: itself with ``after``.
     """
 
-    before: list[CalibrationMarginal | None]
-    after: list[CalibrationMarginal | None]
-    upto: list[CalibrationMarginal]
-    since: list[CalibrationMarginal]
+    before: list[Separated | None]
+    after: list[Separated | None]
+    upto: list[Separated]
+    since: list[Separated]
 
 
 def passes(drives: Sequence[DriveEstimate], steps: Collection[int], config: WalkConfig) -> Passes:
     """One pass forward over the drives and one back, each drive's variables eliminated as it goes."""
-    before, upto = _one_pass(drives, steps, config)
+    parts = [separated(drive.marginal) for drive in drives]
+    days = [abs(k.day - j.day) for j, k in pairwise(drives)]
+    before, upto = _one_pass(parts, days, steps, config)
     mirrored = [len(drives) - k for k in steps]
-    after, since = _one_pass(drives[::-1], mirrored, config)
+    after, since = _one_pass(parts[::-1], days[::-1], mirrored, config)
     return Passes(before, after[::-1], upto, since[::-1])
 
 
 def _one_pass(
-    drives: Sequence[DriveEstimate], steps: Collection[int], config: WalkConfig
-) -> tuple[list[CalibrationMarginal | None], list[CalibrationMarginal]]:
-    predictions: list[CalibrationMarginal | None] = []
-    together: list[CalibrationMarginal] = []
-    for k, drive in enumerate(drives):
+    parts: Sequence[Separated], days: Sequence[float], steps: Collection[int], config: WalkConfig
+) -> tuple[list[Separated | None], list[Separated]]:
+    """Before each drive, and with it; days: from each to the next."""
+    predictions: list[Separated | None] = []
+    together: list[Separated] = []
+    for k, part in enumerate(parts):
         prediction = None
         if k and k not in steps:
-            prediction = walked(together[-1], abs(drive.day - drives[k - 1].day), config)
-        both = drive.marginal if prediction is None else prediction.plus(drive.marginal)
+            last = together[-1]
+            prediction = Separated(walked(last.own, days[k - 1], config), last.common)
+        both = part if prediction is None else prediction.plus(part)
         predictions.append(prediction)
-        together.append(carried(both, *both.best()))
+        together.append(both.carried(*both.own.best()))
     return predictions, together
 
 
