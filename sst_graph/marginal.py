@@ -53,13 +53,36 @@ SCAN_HASHES = "scan_hashes"
 """Key of the hashes of scans in a marginal's file, and in the diagnostics of a result."""
 MOST_SCAN_HASHES = 32
 """Hashes that a result keeps of its scans."""
-COMMON = "common"
-"""Key of the steps by what a marginal has in common with others, in its file."""
+COMMON_ERRORS = "common_errors"
+"""Key of the steps by errors that a marginal has in common with others, in its file."""
 _MOST_COMMON = 100
 _MOST_FUSED = 1_000_000
 _HASH, _HASHES = re.compile("[0-9a-f]{16}"), "texts of 16 hexadecimal digits"
 
 _ORDER = ["rot_x_rad", "rot_y_rad", "rot_z_rad", "trans_x_m", "trans_y_m", "trans_z_m", "time_offset_s"]
+
+
+@dataclass(frozen=True, eq=False)
+class Common(ByValue):
+    """What a marginal may have in common with others.
+
+    Attributes:
+        errors: (7,) step of its optimum by one deviation of each error that marginals of the same sensors
+            have, too, by name; the information holds them.
+        scan_hashes: of some of the scans behind it, by which data that are counted twice are found; empty
+            where they are not known.
+
+    Raises:
+        FactorError: other types or shapes, or values NaN or inf.
+    """
+
+    errors: Mapping[str, FloatArray] = field(default_factory=dict)
+    scan_hashes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        of = "of what marginals have in common"
+        object.__setattr__(self, "errors", _checked_steps(f"errors {of}", self.errors))
+        object.__setattr__(self, "scan_hashes", _checked_hashes(f"scan_hashes {of}", self.scan_hashes))
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,14 +94,11 @@ class CalibrationMarginal(ByValue):
         information: (7, 7) symmetric; positive semi-definite but for a part of a tracker's frames.
         vector: (7,) information times the optimum's d; zero where the point is the optimum.
         constant: twice the cost at d = 0.
-        scan_hashes: of some of the scans behind it, by which data that are counted twice are found; empty
-            where they are not known.
-        common: (7,) step of the optimum by one deviation of each error that marginals of the same sensors
-            have, too, by its name; the information holds them.
+        common: with others.
 
     Raises:
-        FactorError: other types or shapes, values NaN or inf, an information that is not symmetric, or steps
-            that are larger than its covariance.
+        FactorError: other types or shapes, values NaN or inf, an information that is not symmetric, or common
+            errors that are larger than its covariance.
         DataError: a pose whose rotation is none.
     """
 
@@ -87,8 +107,7 @@ class CalibrationMarginal(ByValue):
     information: FloatArray
     vector: FloatArray
     constant: float = 0.0
-    scan_hashes: tuple[str, ...] = ()
-    common: Mapping[str, FloatArray] = field(default_factory=dict)
+    common: Common = field(default_factory=Common)
 
     def __post_init__(self) -> None:
         of = "of CalibrationMarginal"
@@ -102,13 +121,13 @@ class CalibrationMarginal(ByValue):
             "information": information,
             "vector": checked_array(f"vector {of}", self.vector, (7,)),
             "constant": checked_number(f"constant {of}", self.constant),
-            "scan_hashes": _checked_hashes(f"scan_hashes {of}", self.scan_hashes),
-            "common": _checked_steps(f"common {of}", self.common),
         }
         for name, value in plain.items():
             object.__setattr__(self, name, value)
-        if self.common and own_covariance(self.covariance(), self.common) is None:
-            raise FactorError(f"common {of}", "steps past its covariance", "a part of it")
+        checked_type(f"common {of}", self.common, Common, "what it has in common with others (Common)")
+        errors = self.common.errors
+        if errors and own_covariance(self.covariance(), errors) is None:
+            raise FactorError(f"common errors {of}", "more than its covariance", "a part of it")
 
     def factor(self, E_key: int = EXTRINSIC, D_key: int = TIME_OFFSET) -> gtsam.LinearContainerFactor:
         """The cost as a factor on the given keys; it pickles and serializes, and needs gtsam only.
@@ -160,7 +179,7 @@ class CalibrationMarginal(ByValue):
             FactorError: something else than a marginal.
         """
         checked_type("a marginal plus another", other, CalibrationMarginal, "a CalibrationMarginal")
-        if self.common or other.common:
+        if self.common.errors or other.common.errors:
             return replace(self, **vars(separated(self).plus(separated(other)).together()))
         there = other if self.shares_point(other) else carried(other, self.cTl, self.time_offset_s)
         return replace(
@@ -168,7 +187,7 @@ class CalibrationMarginal(ByValue):
             information=self.information + there.information,
             vector=self.vector + there.vector,
             constant=self.constant + there.constant,
-            scan_hashes=tuple(sorted({*self.scan_hashes, *other.scan_hashes})),
+            common=Common({}, tuple(sorted({*self.common.scan_hashes, *other.common.scan_hashes}))),
         )
 
     def shares_point(self, other: CalibrationMarginal) -> bool:
@@ -200,10 +219,10 @@ class CalibrationMarginal(ByValue):
             "constant": self.constant,
             "gtsam_serialized": self.factor(E_key, D_key).serialize(),
         }
-        if self.scan_hashes:
-            document[SCAN_HASHES] = list(self.scan_hashes)
-        if self.common:
-            document[COMMON] = {name: step.tolist() for name, step in self.common.items()}
+        if self.common.scan_hashes:
+            document[SCAN_HASHES] = list(self.common.scan_hashes)
+        if self.common.errors:
+            document[COMMON_ERRORS] = {name: step.tolist() for name, step in self.common.errors.items()}
         return _dump(document)
 
     @staticmethod
@@ -221,12 +240,11 @@ class CalibrationMarginal(ByValue):
             _information(table),
             _bounded(table, "vector", table.matrix("vector", (7,))),
             float(_bounded(table, "constant", np.array(table.number("constant")))),
-            hashes_in(table),
         )
         try:
-            return replace(without, common=steps_in(table))
+            return replace(without, common=Common(steps_in(table), hashes_in(table)))
         except (EstimationError, FactorError) as error:
-            place = f"{table.place}: {COMMON}"
+            place = f"{table.place}: {COMMON_ERRORS}"
             raise DataError(place, str(error), "steps that the information holds") from None
 
 
@@ -236,16 +254,16 @@ class Separated:
 
     Attributes:
         own: the marginal without the common errors.
-        common: (7,) step of its optimum by one deviation of each, by name.
+        errors: (7,) step of its optimum by one deviation of each of these, by name.
     """
 
     own: CalibrationMarginal
-    common: Mapping[str, FloatArray]
+    errors: Mapping[str, FloatArray]
 
     def carried(self, cTl: gtsam.Pose3, time_offset_s: float) -> Separated:
         """The same about another point."""
         _, J = _moved(self.own, cTl, time_offset_s)
-        return Separated(carried(self.own, cTl, time_offset_s), _steps_there(self.common, J))
+        return Separated(carried(self.own, cTl, time_offset_s), _steps_there(self.errors, J))
 
     def plus(self, other: Separated) -> Separated:
         """Both together, at this one's point.
@@ -263,7 +281,7 @@ class Separated:
         Raises:
             EstimationError: a direction without information.
         """
-        return self.own.covariance() + _covariance_by(self.common)
+        return self.own.covariance() + _covariance_by(self.errors)
 
     def together(self) -> CalibrationMarginal:
         """As one marginal, with the same optimum and the same least cost.
@@ -271,10 +289,11 @@ class Separated:
         Raises:
             EstimationError: errors in common, and a direction without information.
         """
-        if not self.common:
+        if not self.errors:
             return self.own
         information = inverse(self.covariance(), "covariance of a marginal")
-        return replace(_with_information(self.own, information), common=self.common)
+        whole = _with_information(self.own, information)
+        return replace(whole, common=replace(whole.common, errors=self.errors))
 
 
 def separated(marginal: CalibrationMarginal) -> Separated:
@@ -283,12 +302,13 @@ def separated(marginal: CalibrationMarginal) -> Separated:
     Raises:
         EstimationError: errors in common, and a direction without information.
     """
-    if not marginal.common:
+    errors = marginal.common.errors
+    if not errors:
         return Separated(marginal, {})
-    own = own_covariance(marginal.covariance(), marginal.common)
+    own = own_covariance(marginal.covariance(), errors)
     assert own is not None  # the marginal has seen to it
     information = inverse(own, "own covariance of a marginal")
-    return Separated(_with_information(marginal, information), marginal.common)
+    return Separated(_with_information(marginal, information), errors)
 
 
 def weighted_steps(parts: Sequence[Separated]) -> dict[str, FloatArray]:
@@ -297,20 +317,20 @@ def weighted_steps(parts: Sequence[Separated]) -> dict[str, FloatArray]:
     Raises:
         EstimationError: errors in common, and a direction without information.
     """
-    names = dict.fromkeys(name for part in parts for name in part.common)
+    names = dict.fromkeys(name for part in parts for name in part.errors)
     if not names:
         return {}
     covariance = inverse(sum((part.own.information for part in parts), np.zeros((7, 7))), "information")
     return {
         name: covariance
-        @ sum((part.own.information @ part.common.get(name, np.zeros(7)) for part in parts), np.zeros(7))
+        @ sum((part.own.information @ part.errors.get(name, np.zeros(7)) for part in parts), np.zeros(7))
         for name in names
     }
 
 
-def own_covariance(covariance: FloatArray, common: Mapping[str, FloatArray]) -> FloatArray | None:
+def own_covariance(covariance: FloatArray, errors: Mapping[str, FloatArray]) -> FloatArray | None:
     """(7, 7) part of a covariance without common errors, or None where that is none."""
-    own = covariance - _covariance_by(common)
+    own = covariance - _covariance_by(errors)
     scale = 1.0 / np.sqrt(np.diag(covariance))
     return own if np.linalg.eigvalsh(own * np.outer(scale, scale))[0] > _LEAST_OWN else None
 
@@ -319,8 +339,8 @@ _LEAST_OWN = 1e-9
 """Least share of a variance that is a marginal's own: rounding takes less."""
 
 
-def _covariance_by(common: Mapping[str, FloatArray]) -> FloatArray:
-    steps = np.reshape([*common.values()], (-1, 7))
+def _covariance_by(errors: Mapping[str, FloatArray]) -> FloatArray:
+    steps = np.reshape([*errors.values()], (-1, 7))
     return np.asarray(steps.T @ steps)
 
 
@@ -330,7 +350,7 @@ def _with_information(marginal: CalibrationMarginal, information: FloatArray) ->
     vector = information @ d
     constant = marginal.constant - float(marginal.vector @ d) + float(vector @ d)
     point = marginal.cTl, marginal.time_offset_s
-    return CalibrationMarginal(*point, information, vector, constant, marginal.scan_hashes)
+    return CalibrationMarginal(*point, information, vector, constant, replace(marginal.common, errors={}))
 
 
 def marginal_keys(E_key: Any, D_key: Any) -> tuple[int, int]:
@@ -370,10 +390,12 @@ def steps_in(table: JsonTable) -> dict[str, FloatArray]:
     Raises:
         DataError: something else.
     """
-    found = table.mapping(COMMON) if COMMON in table.data else {}
+    found = table.mapping(COMMON_ERRORS) if COMMON_ERRORS in table.data else {}
     if len(found) > _MOST_COMMON:
-        raise DataError(f"{table.place}: {COMMON}", count_of(len(found), "step"), f"at most {_MOST_COMMON}")
-    inner = JsonTable(found, f"{table.place}: {COMMON}")
+        raise DataError(
+            f"{table.place}: {COMMON_ERRORS}", count_of(len(found), "step"), f"at most {_MOST_COMMON}"
+        )
+    inner = JsonTable(found, f"{table.place}: {COMMON_ERRORS}")
     return {checked_text(name, inner.place): inner.matrix(name, (7,)) for name in found}
 
 
@@ -443,15 +465,13 @@ def carried(marginal: CalibrationMarginal, cTl: gtsam.Pose3, time_offset_s: floa
     shift, J = _moved(marginal, cTl, time_offset_s)
     L, g = marginal.information, marginal.vector
     constant = marginal.constant - 2.0 * float(g @ shift) + float(shift @ L @ shift)
-    vector, common = J.T @ (g - L @ shift), _steps_there(marginal.common, J)
-    return CalibrationMarginal(
-        cTl, time_offset_s, J.T @ L @ J, vector, constant, marginal.scan_hashes, common
-    )
+    common = replace(marginal.common, errors=_steps_there(marginal.common.errors, J))
+    return CalibrationMarginal(cTl, time_offset_s, J.T @ L @ J, J.T @ (g - L @ shift), constant, common)
 
 
-def _steps_there(common: Mapping[str, FloatArray], J: FloatArray) -> dict[str, FloatArray]:
+def _steps_there(errors: Mapping[str, FloatArray], J: FloatArray) -> dict[str, FloatArray]:
     """Steps about the point from which J leads."""
-    return {name: np.asarray(np.linalg.solve(J, step)) for name, step in common.items()}
+    return {name: np.asarray(np.linalg.solve(J, step)) for name, step in errors.items()}
 
 
 def _moved(

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from sst_graph.fleet import Record
 from sst_graph.fleet.vehicles.changes import Findings, find_changes
 from sst_graph.fleet.vehicles.walk import DriveEstimate, WalkConfig
-from sst_graph.marginal import CalibrationMarginal
+from sst_graph.marginal import CalibrationMarginal, Common
 
 FloatArray = NDArray[np.float64]
 
@@ -70,7 +70,7 @@ def stepped(drives: Sequence[DriveEstimate], at: int, step: FloatArray) -> list[
 
 def apart(drives: Sequence[DriveEstimate]) -> list[DriveEstimate]:
     """The drives as if nothing were common to them."""
-    return [replace(drive, marginal=replace(drive.marginal, common={})) for drive in drives]
+    return [replace(drive, marginal=replace(drive.marginal, common=Common())) for drive in drives]
 
 
 def shuffled(drives: Sequence[DriveEstimate], rng: np.random.Generator) -> list[DriveEstimate]:

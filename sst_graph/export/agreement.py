@@ -77,7 +77,7 @@ def check_apart(marginals: Sequence[CalibrationMarginal], names: Sequence[str] =
     owners: dict[str | bytes, int] = {}
     for k, one in enumerate(marginals):
         numbers = (one.cTl.matrix(), np.array(one.time_offset_s), one.information, one.vector)
-        own: list[str | bytes] = [*one.scan_hashes, b"".join(array.tobytes() for array in numbers)]
+        own: list[str | bytes] = [*one.common.scan_hashes, b"".join(array.tobytes() for array in numbers)]
         known = [owners[mark] for mark in own if mark in owners]
         if known:
             first, second = (repr(names[i]) if names else f"number {i}" for i in (known[0], k))
@@ -104,7 +104,7 @@ def _check_answers(informations: Sequence[FloatArray], names: Sequence[str]) -> 
 def _estimate(part: Separated) -> PartEstimate:
     """A marginal's own optimum; a direction that it does not determine has a large variance."""
     covariance = np.asarray(np.linalg.inv(part.own.information + np.eye(7) / _FAR_SIGMA**2), np.float64)
-    return PartEstimate(covariance @ part.own.vector, covariance, common=part.common)
+    return PartEstimate(covariance @ part.own.vector, covariance, common=part.errors)
 
 
 def _disagreement(parts: Sequence[Separated], estimates: Sequence[PartEstimate]) -> float:
@@ -112,7 +112,7 @@ def _disagreement(parts: Sequence[Separated], estimates: Sequence[PartEstimate])
 
     The least over x and a of sum (d_k - x - S_k a)' L_k (d_k - x - S_k a) + a' a.
     """
-    names = list(dict.fromkeys(name for part in parts for name in part.common))
+    names = list(dict.fromkeys(name for part in parts for name in part.errors))
     around = combined(estimates).step
     H = np.diag([0.0] * 7 + [1.0] * len(names))
     g, constant = np.zeros(len(H)), 0.0

@@ -27,6 +27,7 @@ from sst_graph.marginal import (
     TIME_OFFSET,
     VERSION,
     CalibrationMarginal,
+    Common,
     Separated,
     marginal_keys,
     own_covariance,
@@ -46,7 +47,8 @@ __all__ = [
     "TIME_OFFSET",
     "VERSION",
     "CalibrationMarginal",
-    "common_steps",
+    "Common",
+    "common_errors",
     "fuse_graphs",
     "fuse_marginals",
     "marginal_of_graph",
@@ -71,13 +73,13 @@ def marginal_of_result(result: CalibrationResult) -> CalibrationMarginal:
     """
     checked_type("result", result, CalibrationResult, "a CalibrationResult")
     information = _inverse(result.covariance, "covariance of the result")
-    hashes, common = result.diagnostics.get(SCAN_HASHES, ()), common_steps(result)
+    common = Common(common_errors(result), result.diagnostics.get(SCAN_HASHES, ()))
     return CalibrationMarginal(
-        result.T_camera_lidar, result.time_offset_s, information, np.zeros(7), 0.0, hashes, common
+        result.T_camera_lidar, result.time_offset_s, information, np.zeros(7), common=common
     )
 
 
-def common_steps(result: CalibrationResult) -> dict[str, FloatArray]:
+def common_errors(result: CalibrationResult) -> dict[str, FloatArray]:
     """(7,) step of a result by one deviation of each assumption that its covariance holds, by name.
 
     All results of the same two sensors err by these together. Empty where the covariance does not hold them,
@@ -254,7 +256,7 @@ def fuse_marginals(
     point by its first derivative, which holds while the points differ by little (a degree, a decimetre). By
     how much the sum of the costs at their common optimum exceeds the sum of their own minima is a
     chi-squared, and so is what each differs from the others by: both are tested. Errors that the marginals
-    have in common (:attr:`CalibrationMarginal.common`) do not average out, and hide no contradiction.
+    have in common (:class:`Common`) do not average out, and hide no contradiction.
 
     Args:
         names: of the marginals, for the error; numbers from 0 where none are given.
@@ -289,7 +291,7 @@ def fuse_marginals(
             sum((own.information for own in owns), np.zeros((7, 7))),
             sum((own.vector for own in owns), np.zeros(7)),
             sum(own.constant for own in owns),
-            tuple(sorted({one for own in owns for one in own.scan_hashes})),
+            Common({}, tuple(sorted({one for own in owns for one in own.common.scan_hashes}))),
         )
         step = total.covariance() @ total.vector
         fused = _carried(total, *total.best())
@@ -300,8 +302,8 @@ def fuse_marginals(
             f"fusion of {count_of(len(marginals), 'marginal')}: still moving after {_MAX_ROUNDS} rounds"
         )
     check_agreement(parts, fused.cTl, names, significance)
-    common = weighted_steps([one.carried(fused.cTl, fused.time_offset_s) for one in separate])
-    return Separated(fused, common).together()
+    errors = weighted_steps([one.carried(fused.cTl, fused.time_offset_s) for one in separate])
+    return Separated(fused, errors).together()
 
 
 _MAX_ROUNDS, _STANDSTILL_SIGMAS = 50, 1e-6

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError, printable
-from sst_graph.export import common_steps
+from sst_graph.export import common_errors
 from sst_graph.files.json_table import json_table
 from sst_graph.files.reading import FileKind, parse_json
 from sst_graph.files.strict_json import strict_json
 from sst_graph.inspect.reasons import short_reasons
-from sst_graph.marginal import SCAN_HASHES, CalibrationMarginal, hashes_in, inverse, steps_in
+from sst_graph.marginal import SCAN_HASHES, CalibrationMarginal, Common, hashes_in, inverse, steps_in
 from sst_graph.result import CalibrationResult
 
 FloatArray = NDArray[np.float64]
@@ -81,7 +81,7 @@ class Numbers:
         T_camera_lidar: 4 rows of 4.
         time_offset_s: [s].
         covariance: 7 rows of 7.
-        common: 7 numbers for each assumption, by its name: what one deviation of it shifts the result by.
+        common_errors: 7 numbers for each assumption, by name: what one deviation of it shifts the result by.
         frames: how many took part.
         camera: name of the camera.
         scan_hashes: of some of its scans.
@@ -90,7 +90,7 @@ class Numbers:
     T_camera_lidar: list[list[float]]
     time_offset_s: float
     covariance: list[list[float]]
-    common: dict[str, list[float]]
+    common_errors: dict[str, list[float]]
     frames: int
     camera: str
     scan_hashes: tuple[str, ...] = ()
@@ -102,7 +102,7 @@ class Numbers:
             result.T_camera_lidar.matrix().tolist(),
             result.time_offset_s,
             result.covariance.tolist(),
-            {name: step.tolist() for name, step in common_steps(result).items()},
+            {name: step.tolist() for name, step in common_errors(result).items()},
             len(result.frames_used),
             result.camera_name,
             tuple(result.diagnostics.get(SCAN_HASHES, ())),
@@ -121,10 +121,9 @@ class Numbers:
         """
         information = inverse(np.array(self.covariance), "covariance of the result")
         cTl = gtsam.Pose3(np.array(self.T_camera_lidar))
-        common = {name: np.array(step) for name, step in self.common.items()}
-        return CalibrationMarginal(
-            cTl, self.time_offset_s, information, np.zeros(7), 0.0, self.scan_hashes, common
-        )
+        errors = {name: np.array(step) for name, step in self.common_errors.items()}
+        common = Common(errors, self.scan_hashes)
+        return CalibrationMarginal(cTl, self.time_offset_s, information, np.zeros(7), common=common)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sst_graph.errors import ContradictionError, DataError, EstimationError
-from sst_graph.export import CalibrationMarginal, common_steps, fuse_marginals, marginal_of_result
+from sst_graph.export import CalibrationMarginal, Common, common_errors, fuse_marginals, marginal_of_result
 from sst_graph.factors import FactorError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.marginal import carried, separated
@@ -72,11 +72,11 @@ def error_of(marginal: CalibrationMarginal) -> FloatArray:
 
 def test_the_steps_of_a_result() -> None:
     one = marginal_of_result(result(1))
-    assert [*one.common] == ["cx", "cy"]
-    np.testing.assert_allclose(one.common["cx"], steps(1)["cx"])
+    assert [*one.common.errors] == ["cx", "cy"]
+    np.testing.assert_allclose(one.common.errors["cx"], steps(1)["cx"])
     np.testing.assert_allclose(one.covariance(), result(1).covariance, rtol=1e-6, atol=1e-15)
     # another covariance than that which they are a part of
-    assert common_steps(replace(result(1), covariance=1e-3 * result(1).covariance)) == {}
+    assert common_errors(replace(result(1), covariance=1e-3 * result(1).covariance)) == {}
 
 
 def test_their_own_part() -> None:
@@ -85,7 +85,7 @@ def test_their_own_part() -> None:
     np.testing.assert_allclose(apart.own.covariance(), own_covariance(2), rtol=1e-6, atol=1e-15)
     again = apart.together()
     np.testing.assert_allclose(again.information, one.information, rtol=1e-6)
-    np.testing.assert_array_equal(again.common["cy"], one.common["cy"])
+    np.testing.assert_array_equal(again.common.errors["cy"], one.common.errors["cy"])
 
 
 def test_what_they_have_in_common_does_not_average_out() -> None:
@@ -96,7 +96,7 @@ def test_what_they_have_in_common_does_not_average_out() -> None:
         fused = fuse_marginals(parts, significance=0.0)
         d = error_of(fused)
         squared.append(d @ fused.information @ d)
-        independent = fuse_marginals([replace(part, common={}) for part in parts], significance=0.0)
+        independent = fuse_marginals([replace(part, common=Common()) for part in parts], significance=0.0)
         d = error_of(independent)
         alone.append(d @ independent.information @ d)
     assert np.mean(squared) == pytest.approx(7.0, rel=0.15)  # deviation of the mean: 0.26
@@ -115,7 +115,7 @@ def test_fused_in_any_order_it_is_the_same() -> None:
             whole.covariance() / np.outer(SIGMAS, SIGMAS),
             atol=0.01,
         )
-        assert [*other.common] == ["cx", "cy"]
+        assert [*other.common.errors] == ["cx", "cy"]
 
 
 def test_agreement_is_as_likely_as_said() -> None:
@@ -133,7 +133,7 @@ def test_agreement_is_as_likely_as_said() -> None:
     knocked = replace(last, cTl=last.cTl.retract(knock))
     with pytest.raises(ContradictionError, match=r"'d' differs from the others in rotation by 0\.\d+°"):
         fuse_marginals([*others, knocked], names="abcd")
-    independent = [replace(one, common={}) for one in (*others, knocked)]
+    independent = [replace(one, common=Common()) for one in (*others, knocked)]
     fuse_marginals(independent)
 
 
@@ -143,28 +143,28 @@ def test_another_point_keeps_the_errors_that_it_stands_for() -> None:
     there = carried(one, TRUE.retract(np.array([turn, -turn, turn, 0.05, 0.0, 0.02])), 0.03)
     best, d = there.best(), there.covariance() @ there.vector
     assert best.cTl.equals(one.cTl, 1e-12)
-    for name, step in one.common.items():
+    for name, step in one.common.errors.items():
         # the optimum moved by a small part of the step, from here and from there
         moved = one.cTl.retract(1e-4 * step[:6])
         seen = there.cTl.localCoordinates(moved) - d[:6]
-        np.testing.assert_allclose(seen, 1e-4 * there.common[name][:6], atol=1e-9)
+        np.testing.assert_allclose(seen, 1e-4 * there.common.errors[name][:6], atol=1e-9)
 
 
 def test_in_a_file() -> None:
     one = marginal_of_result(result(5))
     assert CalibrationMarginal.from_json(one.to_json()) == one
-    without = replace(one, common={})
-    assert "common" not in json.loads(without.to_json())
+    without = replace(one, common=Common())
+    assert "common_errors" not in json.loads(without.to_json())
     for wrong in ({"cx": [1.0] * 6}, {"cx": [1e3] * 7}, {"c\nx": [0.0] * 7}, [1.0], {"cx": "text"}):
         with pytest.raises(DataError, match="common"):
-            CalibrationMarginal.from_json(json.dumps({**json.loads(one.to_json()), "common": wrong}))
+            CalibrationMarginal.from_json(json.dumps({**json.loads(one.to_json()), "common_errors": wrong}))
 
 
 def test_refuses_what_is_no_part_of_it() -> None:
     one = marginal_of_result(result(6))
     for wrong in ({"cx": np.full(7, 1.0)}, {"cx": np.zeros(6)}, {3: np.zeros(7)}, None, {"cx": [np.nan] * 7}):
         with pytest.raises(FactorError, match="common"):
-            replace(one, common=wrong)  # type: ignore[arg-type]
+            replace(one, common=Common(wrong))  # type: ignore[arg-type]
     nothing = CalibrationMarginal(TRUE, 0.0, np.diag([1.0] * 6 + [0.0]), np.zeros(7))
     with pytest.raises(EstimationError):
-        replace(nothing, common={"cx": np.full(7, 1e-3)})
+        replace(nothing, common=Common({"cx": np.full(7, 1e-3)}))

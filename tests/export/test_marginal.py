@@ -21,6 +21,7 @@ from sst_graph.export import (
     EXTRINSIC,
     TIME_OFFSET,
     CalibrationMarginal,
+    Common,
     fuse_graphs,
     fuse_marginals,
     marginal_of_graph,
@@ -431,14 +432,14 @@ SCANS = tuple(f"{k:016x}" for k in range(32))
 
 def test_marginals_of_the_same_scans_are_refused() -> None:
     """Counted twice they make the fused result too sure; a single scan in common is enough."""
-    one, other = (replace(agreeing(k), scan_hashes=SCANS[8 * k : 8 * k + 8]) for k in (1, 2))
-    again = replace(agreeing(3), scan_hashes=(SCANS[15], SCANS[31]))
+    one, other = (replace(agreeing(k), common=Common({}, SCANS[8 * k : 8 * k + 8])) for k in (1, 2))
+    again = replace(agreeing(3), common=Common({}, (SCANS[15], SCANS[31])))
     fused = fuse_marginals([one, other])
-    assert fused.scan_hashes == SCANS[8:24] == one.plus(other).scan_hashes
+    assert fused.common.scan_hashes == SCANS[8:24] == one.plus(other).common.scan_hashes
     for parts, names in (([one, other, again], ("a", "b", "c")), ([fused, again], ("b", "c"))):
         with pytest.raises(EstimationError, match=r"'[ab]' and 'c' are of the same scans: counted twice"):
             fuse_marginals(parts, names=names)
-    assert set(fuse_marginals([fused, again], significance=0.0).scan_hashes) > {SCANS[31]}
+    assert set(fuse_marginals([fused, again], significance=0.0).common.scan_hashes) > {SCANS[31]}
 
 
 def test_equal_marginals_are_refused_without_knowing_their_scans() -> None:
@@ -451,16 +452,16 @@ def test_equal_marginals_are_refused_without_knowing_their_scans() -> None:
 
 
 def test_scans_in_a_file() -> None:
-    known = replace(agreeing(1), scan_hashes=SCANS)
+    known = replace(agreeing(1), common=Common({}, SCANS))
     assert CalibrationMarginal.from_json(known.to_json()) == known
     assert "scan_hashes" not in agreeing(1).to_json()
     found = marginal_of_result(
         CalibrationResult(TRUE, OFFSET_S, covariance(1), "ok", CAMERA, diagnostics={"scan_hashes": SCANS[:2]})
     )
-    assert found.scan_hashes == SCANS[:2]
+    assert found.common.scan_hashes == SCANS[:2]
     for wrong in ("abc", "A" * 16, 5, "0" * 17):
-        with pytest.raises(FactorError, match="scan_hashes of CalibrationMarginal"):
-            replace(known, scan_hashes=(wrong,))  # type: ignore[arg-type]
+        with pytest.raises(FactorError, match="scan_hashes of what marginals"):
+            Common({}, (wrong,))  # type: ignore[arg-type]
         with pytest.raises(DataError, match="scan_hashes"):
             CalibrationMarginal.from_json(json.dumps({**json.loads(known.to_json()), "scan_hashes": [wrong]}))
 

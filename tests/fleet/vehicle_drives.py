@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.fleet.vehicles.walk import DriveEstimate, WalkConfig
-from sst_graph.marginal import CalibrationMarginal
+from sst_graph.marginal import CalibrationMarginal, Common
 
 FloatArray = NDArray[np.float64]
 
@@ -51,9 +51,8 @@ def vehicle(
         covariance = rng.uniform(0.5, 3.0) * mixing @ mixing.T
         error = rng.multivariate_normal(np.zeros(7), covariance) + (wrong or {}).get(k, np.zeros(7)) + shift
         information = np.linalg.inv(covariance + sum(np.outer(s, s) for s in lens.values()))
-        marginal = CalibrationMarginal(
-            cTl.retract(error[:6]), time_offset_s + error[6], information, np.zeros(7), common=lens
-        )
+        at = cTl.retract(error[:6]), time_offset_s + error[6]
+        marginal = CalibrationMarginal(*at, information, np.zeros(7), common=Common(lens))
         drives.append(DriveEstimate(f"drive_{k}", WEEK * k, marginal))
     return drives
 

@@ -133,7 +133,7 @@ def _compared(one: Separated, other: Separated, hypotheses: int) -> Finding:
     for separate in (one, other):
         there = separate.carried(cTl, time_offset_s)
         covariance = there.own.covariance()
-        parts.append(PartEstimate(covariance @ there.own.vector, covariance, common=there.common))
+        parts.append(PartEstimate(covariance @ there.own.vector, covariance, common=there.errors))
     difference = Difference.of(parts[0], parts[1])
     return Finding(difference, cTl, min(1.0, hypotheses * difference.p_value))
 

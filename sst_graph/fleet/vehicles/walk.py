@@ -135,7 +135,7 @@ def _one_pass(
         prediction = None
         if k and k not in steps:
             last = together[-1]
-            prediction = Separated(walked(last.own, days[k - 1], config), last.common)
+            prediction = Separated(walked(last.own, days[k - 1], config), last.errors)
         both = part if prediction is None else prediction.plus(part)
         predictions.append(prediction)
         together.append(both.carried(*both.own.best()))
