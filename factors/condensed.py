@@ -53,14 +53,25 @@ def condense(G: FloatArray, constant: float = 0.0) -> tuple[FloatArray, FloatArr
         ``J^T r = G[:-1, -1]`` and ``J^T J = G[:-1, :-1]``; the last row has a zero Jacobian.
 
     Raises:
-        FactorError: no square matrix of finite numbers, or a constant that is no number from 0 on.
+        FactorError: no square matrix of finite numbers, one that is not symmetric or not positive
+            semi-definite, or a constant that is no number from 0 on.
     """
     G = as_numbers("Gram matrix", G, "(m, m)")
     size = max(len(G), 1) if G.ndim else 1
     G = checked_array("Gram matrix", G, (size, size))
+    scale = np.sqrt(np.abs(np.diag(G)))
+    unit = G / np.outer(*(np.where(scale > 0.0, scale, 1.0),) * 2)
+    if (np.abs(unit - unit.T) > _ROUNDING).any():
+        raise FactorError("Gram matrix", "a matrix that is not symmetric", "one that is")
+    if np.linalg.eigvalsh(unit)[0] < -_ROUNDING * size:
+        raise FactorError("Gram matrix", "a negative eigenvalue", "a positive semi-definite matrix")
     if checked_number("constant of condense", constant) < 0.0:
         raise FactorError("constant of condense", described(constant), "a number from 0 on")
     return condense_gram(G, constant)
+
+
+_ROUNDING = 1e-6
+"""What rounding may leave of a Gram matrix of unit diagonal."""
 
 
 def condense_gram(G: FloatArray, constant: float) -> tuple[FloatArray, FloatArray]:

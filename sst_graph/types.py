@@ -16,6 +16,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.factors.arguments import checked_gtsam, checked_number
 from sst_graph.factors.camera import PinholeCamera
 
 FloatArray = NDArray[np.float64]
@@ -211,10 +212,17 @@ class Calibration(ByValue):
     Attributes:
         cTl: pose of the LiDAR in the camera.
         time_offset_s: offset with the sign of :mod:`factors` [s].
+
+    Raises:
+        FactorError: no pose, or no finite number.
     """
 
     cTl: gtsam.Pose3
     time_offset_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        checked_gtsam("cTl of Calibration", self.cTl, gtsam.Pose3)
+        checked_number("time_offset_s of Calibration", self.time_offset_s)
 
     def local_coordinates(self, other: Calibration) -> FloatArray:
         """(7,) step to another: Log of the poses' difference [rad, m], difference of the offsets [s]."""

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sst_graph.factors import (
+    FactorError,
     RobustKernel,
     condense,
     frame_factor,
@@ -118,3 +119,16 @@ def test_same_path_of_levenberg_marquardt(graphs):
     results = [gtsam.LevenbergMarquardtOptimizer(graph, values).optimize() for graph, values in graphs]
     difference = results[0].localCoordinates(results[1])
     assert max(np.abs(difference.at(key)).max() for key in (E, D, B)) < 1e-7
+
+
+@pytest.mark.parametrize(
+    ("G", "named"),
+    [
+        (np.array([[1.0, 0.5], [0.0, 1.0]]), "symmetric"),
+        (np.diag([1.0, -1.0]), "negative"),
+        (np.array([[1.0, 2.0], [2.0, 1.0]]), "negative"),
+    ],
+)
+def test_refuses_what_is_no_gram_matrix(G, named):
+    with pytest.raises(FactorError, match=named):
+        condense(G)

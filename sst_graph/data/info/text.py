@@ -10,6 +10,8 @@ from sst_graph.errors import count_of
 _WIDTH = 12
 _GAPS = 3
 """Gaps that are named; all are counted."""
+_SLOWEST_HZ = 0.1
+"""A slower rate is shown as a period."""
 
 
 def info_text(info: DriveInfo) -> str:
@@ -47,12 +49,17 @@ def _lines(info: DriveInfo) -> Iterator[tuple[str, str]]:
 def _sensor(sensor: SensorInfo) -> str:
     parts = [f"{sensor.count} in {sensor.place}" if sensor.place else f"{sensor.count}"]
     if sensor.rate_hz is not None:
-        parts.append(f"{sensor.rate_hz:.2f} Hz")
+        parts.append(_rate(sensor.rate_hz))
     if sensor.first_ns is not None and sensor.last_ns is not None:
         parts.append(f"{_stamp(sensor.first_ns)} to {_stamp(sensor.last_ns)}")
     if sensor.gap_count is not None:
         parts.append(count_of(sensor.gap_count, "gap"))
     return ", ".join(parts)
+
+
+def _rate(hz: float) -> str:
+    """A rate; as a period, of which few sensors are, where two decimals do not show it."""
+    return f"{hz:.2f} Hz" if hz >= _SLOWEST_HZ else f"one in {1.0 / hz:.4g} s (are the stamps in seconds?)"
 
 
 def _masks(images: ImageInfo) -> str:

@@ -75,3 +75,13 @@ def test_masks_without_a_class_to_align(kitti_drive: Path, capsys: pytest.Captur
     assert main(["info", str(kitti_drive)]) == 0
     said = capsys.readouterr().out
     assert "masks of 100 % of the images, 100 % of all pixels: none that can be aligned\n" in said
+
+
+def test_stamps_in_another_unit_show_as_a_period(
+    kitti_drive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    times = kitti_drive / "times.txt"
+    times.write_text("\n".join(f"{100.0 * k:.1f}" for k in range(5)))
+    assert main(["info", str(kitti_drive)]) == 0
+    out = capsys.readouterr().out
+    assert "one in 100 s (are the stamps in seconds?)" in out and "0.01 Hz" not in out
