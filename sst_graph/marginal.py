@@ -471,7 +471,10 @@ def carried(marginal: CalibrationMarginal, cTl: gtsam.Pose3, time_offset_s: floa
 
 def _steps_there(errors: Mapping[str, FloatArray], J: FloatArray) -> dict[str, FloatArray]:
     """Steps about the point from which J leads."""
-    return {name: np.asarray(np.linalg.solve(J, step)) for name, step in errors.items()}
+    if not errors:
+        return {}
+    there = np.linalg.solve(J, np.transpose([*errors.values()])).T
+    return dict(zip(errors, np.asarray(there), strict=True))
 
 
 def _moved(

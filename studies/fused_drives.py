@@ -1,0 +1,93 @@
+"""Results of several drives of one vehicle, fused: errors against what the fused covariance says.
+
+    OMP_NUM_THREADS=1 python -m studies.fused_drives --vehicles 20 --drives 6
+
+Every vehicle has sensors with errors of its own: the parameters of all assumptions (focal length, principal
+point, distortion, sweep, clock, ranges, ...) are drawn once from their prior deviations, and are the same in
+all of its drives through small streets (studies/small_streets.py). Each drive is calibrated by itself, and
+the results are fused through their marginals, with what they have in common and as if that were each
+drive's own (apart). Prints a Markdown table: NEES over its dimension, which should be 1, and vehicles that
+the fusion refuses as contradicting, at its own significance of 0.001.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.batch import calibrate_prepared, prepare_drives
+from sst_graph.errors import ContradictionError
+from sst_graph.export import CalibrationMarginal, Common, fuse_marginals, marginal_of_result
+from studies.small_streets import CONFIG, FIRST_SEED, drawn, street
+
+FloatArray = NDArray[np.float64]
+
+_REFERENCE = gtsam.Pose3()
+"""What all streets' extrinsics are moved to, so that one vehicle has one."""
+
+
+def marginal_of(seed: int, vehicle: int) -> CalibrationMarginal | None:
+    """Of the result on a street with the sensors of a vehicle, about the reference, or None of a failure."""
+    drive = drawn(vehicle, street(seed)[1])
+    result = calibrate_prepared(prepare_drives([drive], CONFIG), drive.nominal, CONFIG)
+    if result.status == "not_converged":
+        return None
+    assert drive.truth is not None and drive.truth.time_offset_s is not None
+    off = gtsam.Pose3.Logmap(drive.truth.cTl.between(result.T_camera_lidar))
+    offset_s = result.time_offset_s - drive.truth.time_offset_s
+    return replace(marginal_of_result(result), cTl=_REFERENCE.retract(off), time_offset_s=offset_s)
+
+
+def nees(marginal: CalibrationMarginal) -> float:
+    """Squared error over its covariance, over its dimension."""
+    best = marginal.best()
+    error = np.append(_REFERENCE.localCoordinates(best.cTl), best.time_offset_s)
+    return float(error @ np.linalg.solve(marginal.covariance(), error)) / len(error)
+
+
+def outcome(parts: Sequence[CalibrationMarginal]) -> tuple[float, bool]:
+    """NEES of the fused marginal, and whether fusion refuses its parts."""
+    try:
+        fuse_marginals(parts)
+        refused = False
+    except ContradictionError:
+        refused = True
+    return nees(fuse_marginals(parts, significance=0.0)), refused
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--vehicles", type=int, default=20)
+    parser.add_argument("--drives", type=int, default=6)
+    args = parser.parse_args()
+    cv2.setNumThreads(1)
+    single, together, apart, used = [], [], [], 0
+    for vehicle in range(args.vehicles):
+        seeds = range(
+            FIRST_SEED + 1000 + vehicle * args.drives, FIRST_SEED + 1000 + (vehicle + 1) * args.drives
+        )
+        parts = [part for seed in seeds if (part := marginal_of(seed, vehicle)) is not None]
+        if len(parts) < 2:
+            continue
+        used += len(parts)
+        single += [nees(part) for part in parts]
+        together.append(outcome(parts))
+        apart.append(outcome([replace(part, common=Common()) for part in parts]))
+        print(f"vehicle {vehicle}: {together[-1]} {apart[-1]}", flush=True)
+    print(f"\n{len(together)} vehicles, {used} drives\n")
+    print("| | NEES / dimension: mean, median, largest | refused |\n|---|---|---|")
+    print(f"| drives by themselves | {np.mean(single):.2f}, {np.median(single):.2f}, {max(single):.1f} | – |")
+    for name, found in (("fused", together), ("fused, apart", apart)):
+        values = [one for one, _ in found]
+        numbers = f"{np.mean(values):.2f}, {np.median(values):.2f}, {max(values):.1f}"
+        print(f"| {name} | {numbers} | {sum(refused for _, refused in found)} |")
+
+
+if __name__ == "__main__":
+    main()
