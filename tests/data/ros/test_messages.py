@@ -144,6 +144,11 @@ def test_times_before_the_stamp() -> None:
     np.testing.assert_allclose(cloud.offsets_s, -SECONDS, atol=1e-8)
 
 
+@pytest.mark.parametrize("kind", ["<f4", "<f8", "<u4"])
+def test_times_that_are_all_0_are_none(kind: str) -> None:
+    assert read(table(time=np.zeros(5, kind))).offsets_s is None
+
+
 def test_times_of_another_clock_are_refused() -> None:
     with pytest.raises(DataError, match=r"field 'timestamp' with times up to .*--sweep compensated"):
         read(table(timestamp=SECONDS + 1_600_000_000.0))
