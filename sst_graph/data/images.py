@@ -23,6 +23,9 @@ IMAGE = FileKind("a PNG, JPEG or TIFF file", 128 * 1024 * 1024)
 MAX_PIXELS = 50_000_000
 """Pixels of an image; a picture of 8K video has 33 million. As 16-bit RGBA this many take 0.4 GB."""
 
+DARK = 16
+"""Pictures of no brighter value are black to the eye: so are 12 bits that were kept in 16, read as 8."""
+
 Size = tuple[int, int]
 """Width, height [px]."""
 

@@ -15,15 +15,17 @@ def seconds_after_stamp(values: NDArray[Any], stamp_ns: int) -> NDArray[np.float
     """Times (n,) of points after their scan's stamp [s]; None where all are 0, as drivers leave the field.
 
     Whole numbers are nanoseconds, floats seconds, both after the stamp or on the stamp's clock; floats are
-    nanoseconds on that clock, too (Livox). The first of these readings is taken by which all points lie within
-    FARTHEST_S of the stamp, else that by which they lie nearest: the caller checks the distance, and for NaN.
+    nanoseconds on that clock, too (Livox). The first of these readings by which all points lie within
+    FARTHEST_S of the stamp is taken, else that by which they lie nearest: the caller checks the distance,
+    and for NaN.
     """
     if not values.any():
         return None
     seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+    readings: list[NDArray[np.float64]]
     if values.dtype.kind in "iu":
         whole = values.astype(np.int64)
-        readings = [whole * 1e-9, (whole - stamp_ns) * 1e-9]
+        readings = [whole.astype(np.float64) * 1e-9, (whole - stamp_ns).astype(np.float64) * 1e-9]
     else:
         times = values.astype(np.float64)
         readings = [
