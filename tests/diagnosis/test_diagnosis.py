@@ -148,14 +148,10 @@ def test_black_pictures_are_named_where_pictures_are_used(scale: int, reported: 
     dark = drive().with_images(lambda i: replace(i, pixels=i.pixels // scale))
     drives = prepare_drives([swept(dark)], CalibrationConfig())
     found = [one.sentence for one in preflight(drives, Guess(dark.nominal, 0.0), ())]
-    assert (
-        found[:1]
-        == [
-            "the pictures are black (no value above 15 of 255 in 10 pictures): make them brighter: "
-            "of 12 bits kept in 16, multiply the values by 16"
-        ]
-        * reported
+    sentence = (
+        "the pictures are black (no value above 15 of 255 in 10 pictures): make them brighter, 16 times"
     )
+    assert (bool(found) and found[0].startswith(sentence)) == reported
     assert not any("black" in sentence for sentence in causes(dark))
 
 

@@ -53,7 +53,7 @@ def _missing(method: str, content: Content) -> list[str]:
     if method in _BY_PICTURES and content.images and not content.pictures:
         found.append("pictures")
     if method in _BY_PICTURES and content.black:
-        found.append("pictures that are not black (of 12 bits kept in 16, multiply the values by 16)")
+        found.append("pictures that are not black (12 bits kept in 16 are to be made 16 times brighter)")
     if method in _BY_LABELS:
         if content.scans and not content.point_classes:
             found.append("labels of points")

@@ -80,7 +80,7 @@ def find_drive(path: Path, sequence: str | None) -> Path:
     found = [drive for drive in drives if sequence is None or sequence in _names(drive)]
     if len(found) != 1:
         named = ", ".join(drive.name for drive in drives)
-        asked = "name one of them" if sequence is None else f"{len(found)} are {sequence!r}"
+        asked = "name one of them (--sequence)" if sequence is None else f"{len(found)} are {sequence!r}"
         raise ConfigError(f"{path}: drives {named}: {asked}")
     return found[0]
 

@@ -60,7 +60,7 @@ def test_pictures_of_12_bits_in_16_are_missing_pictures(kitti_drive: Path) -> No
     for path in (kitti_drive / "image_2").iterdir():
         cv2.imwrite(str(path), np.full((6, 8), 4095, np.uint16))
     found = drive_info(open_source(kitti_drive)).missing
-    words = "pictures that are not black (of 12 bits kept in 16, multiply the values by 16)"
+    words = "pictures that are not black (12 bits kept in 16 are to be made 16 times brighter)"
     assert {method for method, missing in found.items() if words in missing} == {"edges", "motion", "paper"}
 
 
