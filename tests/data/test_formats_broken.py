@@ -312,3 +312,10 @@ def test_a_camera_whose_distortion_has_another_name_is_not_taken_for_a_pinhole(
         DataError, match=f"the key '{line.split(':')[0]}', expected none but fx, .*, distortion$"
     ):
         read_camera(path)
+
+
+def test_the_cameras_of_a_raw_drive_are_listed(kitti_drive: Path, tmp_path: Path) -> None:
+    drive = as_kitti_raw(kitti_drive, tmp_path)
+    (drive / "image_02").rename(drive / "image_00")
+    with pytest.raises(ConfigError, match=r"camera 'image_02': .* has image_00 \(--camera\)"):
+        open_source(tmp_path)
