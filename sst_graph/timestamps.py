@@ -22,6 +22,12 @@ MAX_STAMPS = 2_000_000
 LATEST_NS = 2**62
 """Stamps lie within +-146 years of zero, so that no difference of two leaves int64 [ns]."""
 
+Span = tuple[int, int]
+"""First and last stamp [ns]."""
+FAR_APART_S = 5.0
+"""Scans and images that are farther apart are not of one drive, or not stamped by one clock: sensors measure
+every few seconds at least [s]."""
+
 _DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,9})?", re.ASCII)
 _MAX_EXPONENT = 10
 
@@ -66,6 +72,11 @@ def check_rising(stamps_ns: NDArray[np.int64], place: str | Path) -> None:
         kind = "equal" if steps[k] == 0 else "falling"
         found = f"{kind} stamps {k} and {k + 1} (step {int(steps[k]) * 1e-9:g} s)"
         raise DataError(place, found, "stamps that rise strictly")
+
+
+def apart_s(one_ns: Span, other_ns: Span) -> float:
+    """Time between two spans of stamps, 0 where they overlap [s]."""
+    return max(one_ns[0] - other_ns[1], other_ns[0] - one_ns[1], 0) * 1e-9
 
 
 def read_times(path: Path) -> NDArray[np.int64]:

@@ -29,6 +29,7 @@ from sst_graph.diagnosis import preflight
 from sst_graph.errors import SstGraphError
 from sst_graph.metrics import TruthSigma, calibration_errors, tangent_error
 from sst_graph.simulator import SimulationConfig, simulate
+from sst_graph.types import Guess
 
 CLEAN, RIGHT = "clean", "right camera"
 MOST_SIGMAS = 3.0
@@ -49,7 +50,7 @@ def row(name: str, drive: KeptDrive, quick: bool) -> tuple[str, bool]:
     config = CalibrationConfig()
     try:
         prepared = prepare_drives([drive], config)
-        certain = preflight(prepared, drive.nominal, config.classes) if quick else ()
+        certain = preflight(prepared, Guess(drive.nominal, 0.0), config.classes) if quick else ()
         if certain:
             sentence = certain[0].sentence
             return f"before the solution | | {sentence}", name in NAMED and NAMED[name] in sentence

@@ -36,7 +36,7 @@ def with_causes(
 ) -> CalibrationResult:
     """The result with what is probably wrong with the data as its first reasons; with any, it is not ok."""
     by_labels = config.method not in ("motion", "edges", "both")
-    found = preflight(drives, guess.cTl, config.classes if by_labels else ())
+    found = preflight(drives, guess, config.classes if by_labels else ())
     estimated = bool(result.frames_used)
     if not found and estimated:
         camera = other_camera(guess.cTl, result.T_camera_lidar, result.covariance)

@@ -88,13 +88,8 @@ def camera_from_camera_info(
     Raises:
         DataError: an uncalibrated camera, binning or a region of interest, another distortion model.
     """
+    check_full_sensor(info, place)
     width, height = (_whole(info, key, place) for key in ("width", "height"))
-    roi = info.get("roi")
-    region = {key: _member(roi, key) for key in ("x_offset", "y_offset", "width", "height")}
-    binned = max(int(info.get("binning_x", 0)), int(info.get("binning_y", 0))) > 1
-    cut = region["width"] not in (0, width) or region["height"] not in (0, height)
-    if binned or cut or region["x_offset"] or region["y_offset"]:
-        raise DataError(place, "binning or a region of interest", "images of the full sensor")
     if rectified:
         P = _matrix(_either(info, "P", "p", place), (3, 4), f"{place}: P")
         if not P.any():
@@ -106,6 +101,20 @@ def camera_from_camera_info(
     D = _numbers(_either(info, "D", "d", place), f"{place}: D")
     distortion = str(info.get("distortion_model", ""))
     return camera_of(_pinhole(K, width, height, f"{place}: K"), distortion, D, place)
+
+
+def check_full_sensor(info: Table, place: str | Path) -> None:
+    """Refuse a ``CameraInfo`` of images that are binned, or of a part of the sensor.
+
+    Raises:
+        DataError: it is.
+    """
+    width, height, roi = _member(info, "width"), _member(info, "height"), info.get("roi")
+    region = {key: _member(roi, key) for key in ("x_offset", "y_offset", "width", "height")}
+    binned = max(int(info.get("binning_x", 0)), int(info.get("binning_y", 0))) > 1
+    cut = region["width"] not in (0, width) or region["height"] not in (0, height)
+    if binned or cut or region["x_offset"] or region["y_offset"]:
+        raise DataError(place, "binning or a region of interest", "images of the full sensor")
 
 
 def _member(group: object, name: str) -> int:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.data.decoder_output import decoder_output
-from sst_graph.data.image_header import check_whole, image_size
+from sst_graph.data.image_header import JPEG, check_whole, image_size
 from sst_graph.errors import DataError
 from sst_graph.files.reading import FileKind, read_file
 
@@ -22,6 +22,9 @@ IMAGE = FileKind("a PNG, JPEG or TIFF file", 128 * 1024 * 1024)
 
 MAX_PIXELS = 50_000_000
 """Pixels of an image; a picture of 8K video has 33 million. As 16-bit RGBA this many take 0.4 GB."""
+
+DARK = 16
+"""Pictures of no brighter value are black to the eye: so are 12 bits that were kept in 16, read as 8."""
 
 Size = tuple[int, int]
 """Width, height [px]."""
@@ -116,6 +119,8 @@ def _single_channel(path: Path, size: Size | None) -> NDArray[Any]:
 
 
 def _one_channel(image: NDArray[Any], data: bytes, place: str | Path) -> NDArray[Any]:
+    if data.startswith(JPEG):
+        raise DataError(place, "a JPEG picture, whose numbers are not exact", "a mask as PNG")
     if image.ndim == 3:
         channels = image[:, :, :3]
         if (channels != channels[:, :, :1]).any():
@@ -163,7 +168,7 @@ def _tells_damage(line: str) -> bool:
 def _checked_size(data: bytes, path: str | Path, expected: Size | None) -> Size:
     width, height = image_size(data, path)
     if expected is not None and (width, height) != expected:
-        wanted = f"{expected[0]}x{expected[1]} px, as the first image"
+        wanted = f"{expected[0]}x{expected[1]} px, the camera's size"
         raise DataError(path, f"{width}x{height} px", wanted)
     if width * height > MAX_PIXELS:
         raise DataError(path, f"{width}x{height} px", f"at most {MAX_PIXELS} pixels")

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from sst_graph.data.images import DARK
 from sst_graph.diagnosis.finding import Finding
+from sst_graph.drive.preparation import Drive
+from sst_graph.errors import count_of
 from sst_graph.factors.camera import PinholeCamera
 
 _FAR = 1.4
@@ -31,4 +34,17 @@ def image_size(camera: PinholeCamera) -> Finding | None:
         f"the pictures are {size} the size the intrinsics were made for",
         f"cx = {camera.cx:.0f} of {camera.width} px, cy = {camera.cy:.0f} of {camera.height} px",
         f"scale fx, fy, cx and cy by that ratio (about {scale:.2g}), or give pictures and masks at full size",
+    )
+
+
+def black_pictures(drive: Drive) -> Finding | None:
+    """Pictures that are all black, or nearly."""
+    images = () if drive.statistics is None else drive.statistics.images
+    brightest = [image.brightest for image in images if image.brightest is not None]
+    if not brightest or max(brightest) >= DARK:
+        return None
+    return Finding(
+        "the pictures are black",
+        f"no value above {max(brightest)} of 255 in {count_of(len(brightest), 'picture')}",
+        "make them brighter, 16 times where 12 bits are kept in 16",
     )

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import gtsam
-
 from sst_graph.diagnosis import cameras, clocks, labels, repeats, units
 from sst_graph.diagnosis.finding import Finding
 from sst_graph.diagnosis.fit import LEAST_QUALITY, WELL, Fit, Fitter
@@ -15,21 +13,22 @@ from sst_graph.drive.preparation import Drive
 from sst_graph.types import Guess, SemanticClass
 
 
-def preflight(
-    drives: Sequence[Drive], guess: gtsam.Pose3 | None, classes: Sequence[SemanticClass]
-) -> tuple[Finding, ...]:
+def preflight(drives: Sequence[Drive], guess: Guess, classes: Sequence[SemanticClass]) -> tuple[Finding, ...]:
     """What is certainly wrong, whatever the calibration says.
 
     Args:
-        guess: where the calibration starts, or None.
+        guess: where the calibration starts.
         classes: that are aligned; empty where labels are not used.
     """
-    found = [units.start_unit(guess), repeats.shared_scans(drives)]
+    found = [units.start_unit(guess.cTl), repeats.shared_scans(drives)]
     for drive in drives:
         found += [cameras.image_size(drive.camera), clocks.stamps(drive), clocks.two_clocks(drive)]
+        found.append(clocks.apart(drive, guess.time_offset_s))
         found.append(repeats.repeats(drive))
         if classes:
             found += [labels.ground_points(drive), labels.mask_rows(drive), units.clouds(drive)]
+        else:
+            found.append(cameras.black_pictures(drive))
     if classes:
         found.append(labels.searched_classes(drives, classes))
         found.append(labels.shifted_masks(labels.shift(drives)))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sst_graph.diagnosis.finding import Finding
 from sst_graph.drive.preparation import Drive
+from sst_graph.timestamps import FAR_APART_S, NS_PER_S, apart_s
 
 FloatArray = NDArray[np.float64]
 
@@ -59,6 +60,22 @@ def stamps(drive: Drive) -> Finding | None:
     if turn_s > _SLOWEST_TURN_S:
         return _wrong_rate("too fast", period, [f"a turn of the scanner takes {1e3 * turn_s:.0f} ms"])
     return None
+
+
+def apart(drive: Drive, time_offset_s: float) -> Finding | None:
+    """Scans and images of different times, under the offset that the calibration starts from [s]."""
+    if not drive.scans or not drive.images:
+        return None
+    scans, images = ((stamps[0], stamps[-1]) for stamps in (drive.scan_stamps_ns, drive.image_stamps_ns))
+    offset_ns = round(time_offset_s * NS_PER_S)
+    if apart_s(scans, (images[0] + offset_ns, images[1] + offset_ns)) < FAR_APART_S:
+        return None
+    spans = [f"from {first * 1e-9:.3f} to {last * 1e-9:.3f} s" for first, last in (scans, images)]
+    return Finding(
+        "no image is of the time of the scans",
+        f"scans {spans[0]}, images {spans[1]}",
+        "write the stamps of both by one clock, or give the time offset by --init FILE",
+    )
 
 
 def two_clocks(drive: Drive) -> Finding | None:

@@ -74,16 +74,18 @@ def clouds(drive: Drive) -> Finding | None:
 
 
 def axes(drive: Drive, guess: gtsam.Pose3 | None) -> Finding | None:
-    """Clouds in the camera's axes under a start that is not made for them: the ground shows what is down."""
+    """Clouds in the camera's axes: the ground shows what is down. A start of which the camera's axes are not
+    the clouds' is that of a LiDAR on its side, where its ground is below the camera."""
     ground = usual_ground(drive)
     if ground is None or ground.share < FLAT or ground.up[1] > -_UPRIGHT:
         return None
-    if guess is not None and float((guess.rotation().matrix() @ ground.up)[1]) < -_UPRIGHT:
+    R = np.eye(3) if guess is None else guess.rotation().matrix()
+    if float((R @ ground.up)[1]) < -_UPRIGHT and R[2, 2] < _UPRIGHT:
         return None
     x, y, z = ground.up
     return Finding(
         "the clouds are in the camera's axes (x right, y down, z forward)",
-        f"the ground's normal is ({x:.2f}, {y:.2f}, {z:.2f}), expected (0, 0, 1)",
+        f"the ground's normal is {x:.2f} {y:.2f} {z:.2f}, expected 0 0 1",
         "give clouds in the LiDAR's axes (x forward, y left, z up), and a start that goes with them",
     )
 

@@ -100,6 +100,7 @@ class ImageStatistics:
         labelled: number of pixels by class.
         rows: mean row of each class's pixels, as a share of the image's height.
         profiles: what the picture shows along the mask's contours, and beside them.
+        brightest: largest value of the picture, 0 to 255; None where there is none.
     """
 
     index: int
@@ -108,6 +109,7 @@ class ImageStatistics:
     labelled: Mapping[int, int]
     rows: Mapping[int, float]
     profiles: tuple[ContourProfile, ...] = ()
+    brightest: int | None = None
 
 
 @dataclass(frozen=True)
@@ -199,6 +201,7 @@ def image_statistics(index: int, image: CameraImage, closely: bool = True) -> Im
         labelled,
         {c: row / height for c, row in rows.items()},
         contour_profiles(image.mask, image.pixels, SemanticClass.VEHICLE) if closely and shows else (),
+        int(image.pixels.max()) if image.has_picture else None,
     )
 
 

@@ -322,7 +322,7 @@ def _check_matches(matches: int, pairs: int, config: JointConfig) -> None:
     if not matches:
         raise EstimationError(
             f"no silhouette matches, {expected}: no boundary point of a scan is near a contour of its "
-            "class in the image of its time"
+            "class, or an edge of the picture, in the image of its time"
         )
     found = count_of(matches, "silhouette match", "silhouette matches")
     raise EstimationError(f"{found} in {count_of(pairs, 'pair')} of scan and image, {expected}")

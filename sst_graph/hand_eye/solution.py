@@ -122,7 +122,11 @@ def solve_motion(
     # 2. Rotation and time offset on a grid of offsets.
     starts = motion_starts(steps, paths, guess, max_offset_s)
     if not starts:
-        raise EstimationError(_too_few(len(steps)))
+        raise EstimationError(
+            f"no time offset within {max_offset_s:g} s of {guess.time_offset_s:g} s at which the LiDAR's "
+            f"motion is known over the time of the camera's ({count_of(len(steps), 'motion')}): "
+            "compare the stamps of scans and images"
+        )
     # 3. The graph from each of them, a few steps; from those that differ and fit alike to the end.
     translation = np.zeros(3) if guess.cTl is None else guess.cTl.translation()
     solutions: list[MotionSolution] = []

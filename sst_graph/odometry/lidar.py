@@ -168,7 +168,7 @@ class LidarOdometry:
             # Static objects of movable classes (parked cars) help where there is little else.
             parked = self._static.find(_transformed(wTl, others), scan.stamp_ns)
             found = self._align(np.concatenate([points, others[parked]]), wTl, seconds)
-            if found is None or scan.offsets_s is None:
+            if found is None or scan.offsets_s is None or not scan.offsets_s.any():
                 return found
             change = np.inf if twist is None else np.abs(found.twist - twist)[3:].max()
             if change * np.abs(scan.offsets_s).max(initial=0.0) < _CONVERGED_M:

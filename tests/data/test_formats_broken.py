@@ -194,7 +194,7 @@ def test_a_broken_drive_ends_a_command_with_2(
         ("raw", {"camera": "left"}, "expected image_0N"),
         ("folder", {"sequence": "0"}, "images and clouds only"),
         ("folder", {"camera": "left"}, "cameras images: none is .left."),
-        ("nuscenes", {}, "2 scenes .scene-0061, scene-0103.: name one of them"),
+        ("nuscenes", {}, "2 scenes .scene-0061, scene-0103.: name one of them .--sequence."),
         ("nuscenes", {"sequence": "7"}, "none is '7'"),
         ("nuscenes", {"sequence": "61", "camera": "CAM_LEFT"}, "has CAM_BACK, CAM_FRONT"),
     ],
@@ -297,3 +297,25 @@ def test_pictures_of_other_formats(folder: Path, suffix: str) -> None:
     first.write_bytes(first.read_bytes()[:-20])
     with pytest.raises(DataError, match=r"truncated|damaged"):
         open_source(folder)[0]
+
+
+@pytest.mark.parametrize("line", ["k1: -0.3", "distortion_coefficients: [-0.3, 0.1, 0, 0]"])
+def test_a_camera_whose_distortion_has_another_name_is_not_taken_for_a_pinhole(
+    tmp_path: Path, line: str
+) -> None:
+    path = tmp_path / "camera.yaml"
+    plain = "fx: 300\nfy: 300\ncx: 310\ncy: 94\nwidth: 621\nheight: 188\n"
+    path.write_text(plain)
+    assert read_camera(path).is_pinhole
+    path.write_text(plain + line + "\n")
+    with pytest.raises(
+        DataError, match=f"the key '{line.split(':')[0]}', expected none but fx, .*, distortion$"
+    ):
+        read_camera(path)
+
+
+def test_the_cameras_of_a_raw_drive_are_listed(kitti_drive: Path, tmp_path: Path) -> None:
+    drive = as_kitti_raw(kitti_drive, tmp_path)
+    (drive / "image_02").rename(drive / "image_00")
+    with pytest.raises(ConfigError, match=r"camera 'image_02': .* has image_00 \(--camera\)"):
+        open_source(tmp_path)

@@ -17,7 +17,9 @@ from sst_graph import CalibrationConfig, calibrate
 from sst_graph.cameras import BrownConradyCamera, Rectification
 from sst_graph.cli import main
 from sst_graph.data import open_source
+from sst_graph.data.info import drive_info
 from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.errors import DataError
 from sst_graph.types import Frame, Source
 
 
@@ -162,3 +164,23 @@ def test_every_layout_gives_the_same_calibration(tmp_path: Path) -> None:
         result = calibrate(source, source.nominal)
         step = gtsam.Pose3.Logmap(wanted.T_camera_lidar.between(result.T_camera_lidar))
         assert np.abs(step).max() < 1e-6 and abs(result.time_offset_s - wanted.time_offset_s) < 1e-6
+
+
+def test_nuscenes_without_its_sweeps_and_some_labels(kitti_drive: Path, tmp_path: Path) -> None:
+    """Sweeps are downloads of their own."""
+    root = as_nuscenes(kitti_drive, tmp_path / "nuscenes")
+    whole = list(open_source(root, sequence="61"))
+    shutil.rmtree(root / "sweeps")
+    next((root / "lidarseg" / "v1.0-mini").iterdir()).unlink()
+    source = open_source(root, sequence="61")
+    frames = list(source)
+    assert [frame.scan.stamp_ns for frame in frames if frame.scan] == [
+        frame.scan.stamp_ns for frame in whole if frame.scan and frame.index % 2 == 0
+    ]
+    assert sum(frame.scan.has_labels for frame in frames if frame.scan) == len(frames) - 1
+    assert drive_info(source).notes == tuple(
+        f"2 files of {name} missing and left out" for name in ("LIDAR_TOP", "CAM_FRONT")
+    )
+    shutil.rmtree(root / "samples")
+    with pytest.raises(DataError, match="no such file, expected the files of LIDAR_TOP"):
+        open_source(root, sequence="61")

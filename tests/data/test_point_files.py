@@ -107,15 +107,25 @@ def test_times_are_seconds_or_nanoseconds_absolute_or_relative(tmp_path: Path) -
         ("t", np.rint(offsets * 1e9).astype(np.int64), 1e-9),
         ("timestamp", stamp_ns + np.rint(offsets * 1e9).astype(np.int64), 1e-9),
         ("timestamp", stamp_ns * 1e-9 + offsets, 1e-6),
+        ("timestamp", stamp_ns + offsets * 1e9, 1e-6),
         ("time", offsets, 1e-9),
     ):
         np.savez(tmp_path / "a.npz", **xyz, **{name: values})
         found = read_cloud(tmp_path / "a.npz").offsets_s(stamp_ns, used)
         np.testing.assert_allclose(found, offsets, atol=precision)
-    np.savez(tmp_path / "a.npz", **xyz, time=np.array([0.0, np.nan, 3.0]))
+    np.savez(tmp_path / "a.npz", **xyz, time=np.array([0.1, np.nan, 3.0]))
     with pytest.raises(DataError, match=r"2 times that are NaN or beyond 1 s, first at index 1"):
         read_cloud(tmp_path / "a.npz").offsets_s(stamp_ns, used)
     assert read_cloud(tmp_path / "a.npz").offsets_s(stamp_ns, np.array([True, False, False])) is not None
+
+
+def test_times_that_are_all_0_are_none(tmp_path: Path) -> None:
+    """Drivers leave the field unfilled; a point that is left out may have any time."""
+    xyz = {name: np.zeros(3) for name in "xyz"}
+    for values in (np.zeros(3), np.zeros(3, np.int64), np.array([0.0, np.nan, 0.0])):
+        np.savez(tmp_path / "a.npz", **xyz, time=values)
+        used = np.array([True, False, True])
+        assert read_cloud(tmp_path / "a.npz").offsets_s(1_317_042_145_000_000_000, used) is None
 
 
 # --- broken files -----------------------------------------------------------------------------------------

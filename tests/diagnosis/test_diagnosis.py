@@ -21,6 +21,7 @@ from sst_graph.diagnosis.cameras import image_size
 from sst_graph.diagnosis.clocks import stamps, two_clocks
 from sst_graph.diagnosis.hypotheses import best_hypothesis
 from sst_graph.diagnosis.poses import wrong_start
+from sst_graph.diagnosis.units import axes
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
@@ -105,7 +106,7 @@ def swept(data: KeptDrive) -> Source:
 
 def causes(data: KeptDrive) -> list[str]:
     drives = prepare_drives([swept(data)], CalibrationConfig())
-    return [finding.sentence for finding in preflight(drives, data.nominal, CLASSES)]
+    return [finding.sentence for finding in preflight(drives, Guess(data.nominal, 0.0), CLASSES)]
 
 
 def test_right_data_are_left_alone() -> None:
@@ -129,11 +130,36 @@ def test_a_doubled_picture_now_and_then_is_left_to_the_robust_matching() -> None
     assert causes(repeated_pictures(drive(), every=5)) == []
 
 
+@pytest.mark.parametrize(
+    ("late_s", "known_s", "reported"), [(3600.0, 0.0, True), (3600.0, -3600.0, False), (3.0, 0.0, False)]
+)
+def test_images_of_another_time(late_s: float, known_s: float, reported: bool) -> None:
+    """Stamps of another time zone; with the offset in the start they are fine."""
+    late = drive().with_images(lambda i: replace(i, stamp_ns=i.stamp_ns + round(late_s * 1e9)))
+    drives = prepare_drives([swept(late)], CalibrationConfig())
+    found = [one.sentence for one in preflight(drives, Guess(late.nominal, known_s), CLASSES)]
+    named = [sentence for sentence in found if sentence.startswith("no image is of the time of the scans (")]
+    assert bool(named) == reported and all("images from 3600.0" in sentence for sentence in named)
+
+
+@pytest.mark.parametrize(("scale", "reported"), [(16, True), (8, False)])
+def test_black_pictures_are_named_where_pictures_are_used(scale: int, reported: bool) -> None:
+    """12 bits kept in 16 are read as a sixteenth of what they are."""
+    dark = drive().with_images(lambda i: replace(i, pixels=i.pixels // scale))
+    drives = prepare_drives([swept(dark)], CalibrationConfig())
+    found = [one.sentence for one in preflight(drives, Guess(dark.nominal, 0.0), ())]
+    sentence = (
+        "the pictures are black (no value above 15 of 255 in 10 pictures): make them brighter, 16 times"
+    )
+    assert (bool(found) and found[0].startswith(sentence)) == reported
+    assert not any("black" in sentence for sentence in causes(dark))
+
+
 def test_scans_that_are_given_twice_make_no_result_surer() -> None:
     for end, count in ((5, 0), (6, 1)):
         given = [replace(drive(), frames=drive().frames[part]) for part in (slice(0, end), slice(5, 10))]
         drives = prepare_drives(given, CalibrationConfig())
-        found = [finding.evidence for finding in preflight(drives, drive().nominal, CLASSES)]
+        found = [finding.evidence for finding in preflight(drives, Guess(drive().nominal, 0.0), CLASSES)]
         assert len(found) == count
         hashes = [scan_hashes([each]) for each in drives]
         assert [len(own) for own in hashes] == [end, 5] and len({*hashes[0], *hashes[1]}) == end + 5 - count
@@ -244,6 +270,19 @@ def test_checks_that_run_only_where_a_result_is_not_ok(fault: str) -> None:
     assert causes(wrong) == []
     result = calibrate(wrong, wrong.nominal)
     assert result.status != "ok" and NAMED[fault] in result.reasons[0]
+
+
+def test_clouds_in_the_cameras_axes_are_named_with_the_start_that_goes_with_them() -> None:
+    """That of a scanner mounted on its side differs from it by a turn about the vertical."""
+    (wrong,) = prepare_drives([INPUT_FAULTS["clouds in camera axes"](drive(), other())], CalibrationConfig())
+    side = gtsam.Pose3(gtsam.Rot3.Ry(-np.pi / 2.0), np.zeros(3))
+    for start in (None, drive().nominal, gtsam.Pose3()):
+        found = axes(wrong, start)
+        assert found is not None and "(" not in found.evidence
+        assert short_reason(found.sentence).startswith(
+            "the clouds are in the camera's axes: give clouds in the"
+        )
+    assert axes(wrong, side) is None and axes(prepared(), drive().nominal) is None
 
 
 def test_without_the_search_for_causes_only_the_reasons_remain() -> None:

@@ -18,7 +18,7 @@ from sst_graph.batch.motion_factor import gaussian_factor
 from sst_graph.cli import main
 from sst_graph.config import with_overrides
 from sst_graph.data import open_source
-from sst_graph.errors import ConfigError
+from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.graph.state import EXTRINSIC, State, difference, time_offset_key
 from sst_graph.hand_eye.graph import NoiseScales, camera_steps, hand_eye_terms, lidar_paths, pair_motions
 from sst_graph.hand_eye.initialization import motion_starts
@@ -45,6 +45,11 @@ def test_without_noise_all_seven_come_back(guess: gtsam.Pose3 | None) -> None:
     assert np.degrees(np.linalg.norm(error[:3])) < 0.1
     # The camera's motion has no scale: across the road only, and less well, is the lever arm seen.
     assert np.abs(error[3:6]).max() < 0.1 and abs(error[6]) < 1e-3
+
+
+def test_stamps_without_a_common_time_are_named() -> None:
+    with pytest.raises(EstimationError, match=r"no time offset within 0.5 s of 3600 s .*compare the stamps"):
+        solve_motion([made_drive(weaving, noise=0.0)], Guess(None, 3600.0))
 
 
 @pytest.mark.slow

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -292,3 +294,14 @@ def test_a_first_motion_along_a_street_is_not_taken_for_rest(seed: int, speed_mp
     true = drive.wTl(1e-9 * scans[0].stamp_ns).between(drive.wTl(1e-9 * scans[1].stamp_ns))
     assert motion is not None and motion.ok
     assert np.linalg.norm(true.between(motion.aTb).translation()) < 0.02
+
+
+@pytest.mark.filterwarnings("error")
+def test_times_that_are_all_0_need_no_compensation() -> None:
+    poses = path(5.0, 0.1, 3)
+    scans = [scan_at(pose, k * PERIOD_NS, k) for k, pose in enumerate(poses)]
+    motions = lidar_odometry(
+        [replace(scan, offsets_s=np.zeros(len(scan.points), np.float32)) for scan in scans]
+    )
+    for k, motion in enumerate(motions):
+        assert motion.ok and motion.aTb.equals(poses[k].inverse() * poses[k + 1], 0.01)

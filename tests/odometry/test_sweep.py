@@ -324,6 +324,25 @@ def test_a_source_is_read_once_and_its_own_times_are_kept() -> None:
     assert with_sweep(source, decide=False).sweep_decision.kind == "given"
 
 
+def test_a_first_scan_without_points_says_nothing_of_times() -> None:
+    drive = simulated(replace(STREET, frames=3))
+    first = drive[0].scan
+    assert first is not None
+    empty = Scan(first.stamp_ns, first.points[:0], first.classes[:0])
+    frames = [Frame(0, empty, None), drive[1], drive[2]]
+
+    class Source:
+        name, camera, nominal, truth = "street", drive.camera, None, None
+
+        def __len__(self) -> int:
+            return 3
+
+        def __getitem__(self, position: int) -> Frame:
+            return frames[position]
+
+    assert with_sweep(Source()).sweep_decision.kind == "given"  # type: ignore[arg-type]
+
+
 def test_the_sweep_of_a_result_is_used_again() -> None:
     decision = SweepDecision("clockwise", SweepTiming(-1.0, np.pi, 0.1), -0.97, 0.05)
     drive = simulated(replace(STREET, frames=3, sweep_output="raw"))

@@ -26,6 +26,7 @@ from sst_graph.files.checked_values import checked_pose, pinhole_camera
 from sst_graph.files.yaml_file import number, numbers, read_yaml
 
 _EXPECTED = "fx, fy, cx, cy, width, height; or Kalibr's cam0; or OpenCV's camera_matrix"
+_PLAIN = ("fx", "fy", "cx", "cy", "width", "height", "distortion_model", "distortion")
 _ROUNDED = 1e-3
 """A quaternion's length differs from 1 by no more than its digits were rounded."""
 
@@ -39,7 +40,9 @@ def read_camera(path: Path) -> CameraModel:
     """
     table = read_yaml(path)
     if "fx" in table:
-        names = ("fx", "fy", "cx", "cy", "width", "height")
+        if unknown := [key for key in table if key not in _PLAIN]:
+            raise DataError(path, f"the key {unknown[0]!r:.60}", f"none but {', '.join(_PLAIN)}")
+        names = _PLAIN[:6]
         fx, fy, cx, cy, *size = (number(_entry(table, name, path), f"{path} ({name})") for name in names)
         width, height = (_whole(side, path) for side in size)
         intrinsics = pinhole_camera((fx, fy, cx, cy), (width, height), path)

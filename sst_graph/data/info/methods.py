@@ -21,6 +21,8 @@ class Content:
         pictures: whether images have pictures, not masks alone.
         point_classes, mask_classes: names of the classes on each side that can be aligned.
         nominal: whether there is a nominal extrinsic.
+        black: whether the pictures are black, or nearly.
+        together: whether the scans and the images are of one time.
     """
 
     scans: int
@@ -29,6 +31,8 @@ class Content:
     point_classes: frozenset[str]
     mask_classes: frozenset[str]
     nominal: bool
+    black: bool = False
+    together: bool = True
 
 
 def missing_for(content: Content) -> dict[str, tuple[str, ...]]:
@@ -48,6 +52,8 @@ def _missing(method: str, content: Content) -> list[str]:
         found.append("images")
     if method in _BY_PICTURES and content.images and not content.pictures:
         found.append("pictures")
+    if method in _BY_PICTURES and content.black:
+        found.append("pictures that are not black (12 bits kept in 16 are to be made 16 times brighter)")
     if method in _BY_LABELS:
         if content.scans and not content.point_classes:
             found.append("labels of points")
@@ -56,6 +62,8 @@ def _missing(method: str, content: Content) -> list[str]:
         both = content.point_classes and content.mask_classes
         if both and not content.point_classes & content.mask_classes:
             found.append("a class that points and masks both have")
+    if content.scans and content.images and not content.together:
+        found.append("images of the time of the scans (--init FILE gives the offset between their stamps)")
     if not content.nominal:
         without = "--init FILE gives a start" if method in _NO_SEARCH else "--init none does without"
         found.append(f"a nominal extrinsic ({without})")

@@ -10,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.data.frame_parts import image_at, image_positions, scan_at, scan_positions
+from sst_graph.data.images import DARK
 from sst_graph.data.info.facts import FactsReader, SensorFacts, SourceFacts
 from sst_graph.data.info.methods import Content, missing_for
 from sst_graph.sampling import evenly_spread
+from sst_graph.timestamps import FAR_APART_S, apart_s
 from sst_graph.types import CameraImage, Scan, SemanticClass, Source
 
 LONG_INTERVAL = 1.5
@@ -147,6 +149,8 @@ def drive_info(source: Source) -> DriveInfo:
         point_classes=frozenset(of_scans.classes if of_scans else ()),
         mask_classes=frozenset(of_images.classes if of_images else ()),
         nominal=source.nominal is not None,
+        black=_black(images),
+        together=_together(scan_sensor, image_sensor),
     )
     return DriveInfo(
         name=source.name,
@@ -161,6 +165,20 @@ def drive_info(source: Source) -> DriveInfo:
         notes=facts.notes,
         missing=missing_for(content),
     )
+
+
+def _black(images: Sequence[CameraImage]) -> bool:
+    """Whether no picture among the images has a bright pixel."""
+    pictures = [image.pixels for image in images if image.has_picture]
+    return bool(pictures) and max(int(pixels.max()) for pixels in pictures) < DARK
+
+
+def _together(one: SensorInfo, other: SensorInfo) -> bool:
+    """Whether two sensors measured at the same time, by their stamps."""
+    if None in (one.first_ns, one.last_ns, other.first_ns, other.last_ns):
+        return True
+    spans = [(sensor.first_ns or 0, sensor.last_ns or 0) for sensor in (one, other)]
+    return apart_s(*spans) < FAR_APART_S
 
 
 def _sensor(

@@ -86,7 +86,9 @@ def find_sequence(path: Path, sequence: str | None) -> Path:
         raise DataError(path / "sequences", "an empty folder", "folders 00, 01, ...")
     if sequence is None:
         if len(names) > 1:
-            raise ConfigError(f"{path}: several sequences ({', '.join(names)}): name one of them")
+            raise ConfigError(
+                f"{path}: several sequences ({', '.join(names)}): name one of them (--sequence)"
+            )
         return path / "sequences" / names[0]
     matches = [name for name in names if name in (sequence, sequence.zfill(2))]
     if not matches:
@@ -167,7 +169,8 @@ def _check_stamps(times: Path, stamps: int, files: Mapping[int, Path], what: str
     """Require a stamp for each number up to the last file's, and no more."""
     count = max(files) + 1
     if count != stamps:
-        raise DataError(times, count_of(stamps, "stamp"), f"{count}, as there are {what}")
+        last = files[max(files)].name
+        raise DataError(times, count_of(stamps, "stamp"), f"{count}, as there are {what} from 0 to {last}")
 
 
 def _optional(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:

@@ -80,7 +80,7 @@ def find_drive(path: Path, sequence: str | None) -> Path:
     found = [drive for drive in drives if sequence is None or sequence in _names(drive)]
     if len(found) != 1:
         named = ", ".join(drive.name for drive in drives)
-        asked = "name one of them" if sequence is None else f"{len(found)} are {sequence!r}"
+        asked = "name one of them (--sequence)" if sequence is None else f"{len(found)} are {sequence!r}"
         raise ConfigError(f"{path}: drives {named}: {asked}")
     return found[0]
 
@@ -102,8 +102,12 @@ def find_raw_files(drive: Path, camera: int) -> RawFiles:
 
     Raises:
         DataError: no scan, no image, a file without its stamp, stamps that do not rise.
+        ConfigError: no such camera, where there are others.
     """
     cloud, images = drive / _CLOUD, drive / f"image_{camera:02d}"
+    there = [entry.name for entry in listed(drive, LAYOUT) if re.fullmatch(r"image_\d\d", entry.name)]
+    if there and images.name not in there:
+        raise ConfigError(f"camera {images.name!r}: {drive} has {', '.join(there)} (--camera)")
     scans = numbered_files(cloud / "data", (".bin", ".txt"))
     pictures = numbered_files(images / "data", (".png", ".jpg", ".jpeg"))
     scan_stamps, image_stamps = (read_timestamps(folder / "timestamps.txt") for folder in (cloud, images))

@@ -9,9 +9,10 @@ Source: the schema in docs/schema_nuscenes.md of nutonomy/nuscenes-devkit.
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import gtsam
@@ -31,6 +32,8 @@ from sst_graph.errors import ConfigError, DataError, count_of, printable
 from sst_graph.files.reading import FileKind, read_file
 from sst_graph.sweep_timing import SweepTiming
 from sst_graph.types import CameraImage, GroundTruth, Scan, SemanticClass, Source, with_intensities
+
+_LOG = logging.getLogger(__name__)
 
 LAYOUT = "nuScenes: PATH with v1.0-* (tables), samples and sweeps"
 _LIDAR, _CAMERA = "LIDAR_TOP", "CAM_FRONT"
@@ -129,7 +132,8 @@ def open_nuscenes(path: Path, options: SourceOptions) -> Source:
         raise ConfigError(f"{path}: tables {named}: keep one of them in the folder")
     tables = versions[0]
     scene = _scene(tables, options.sequence)
-    lidar, camera = _channels(tables, scene, _camera_name(options.camera))
+    stored = _channels(tables, scene, _camera_name(options.camera))
+    lidar, camera = (_present(path, tables, channel) for channel in stored)
     model, nominal = _rig(tables, lidar, camera)
     size = (model.width, model.height)
     pictures = PictureFiles(size, dict(enumerate(_paths(path, tables, camera))))
@@ -140,7 +144,12 @@ def open_nuscenes(path: Path, options: SourceOptions) -> Source:
         return pictures.image(k, int(image_stamps[k]))
 
     name = f"nuscenes/{printable(text_of(scene, 'name', tables))}"
-    properties = DriveProperties(name, model.intrinsics, nominal, GroundTruth(nominal, None), True)
+    notes = tuple(_left_out(before, after) for before, after in zip(stored, (lidar, camera), strict=True))
+    properties = DriveProperties(
+        name, model.intrinsics, nominal, GroundTruth(nominal, None), True, notes=tuple(filter(None, notes))
+    )
+    for note in properties.notes:
+        _LOG.warning("%s: %s", printable(path), note)
     of_scans = Sensor(scans.stamps_ns, scans.scan, lidar.name)
     drive = merged(properties, of_scans, Sensor(image_stamps, image, camera.name), options, path)
     return drive if model.is_pinhole else RectifiedSource(drive, Rectification.of(model))
@@ -165,7 +174,7 @@ def _scene(tables: Path, name: str | None) -> Record:
     found = [scene for key, scene in scenes.items() if key in wanted]
     if not found:
         some = ", ".join(list(scenes)[:12]) + (", ..." if len(scenes) > 12 else "")
-        asked = "name one of them" if name is None else f"none is {name!r}"
+        asked = "name one of them (--sequence)" if name is None else f"none is {name!r}"
         raise ConfigError(f"{tables}: {count_of(len(scenes), 'scene')} ({some}): {asked}")
     return found[0]
 
@@ -213,6 +222,25 @@ def _channels(tables: Path, scene: Record, camera: str) -> tuple[Channel, Channe
     return found[0], found[1]
 
 
+def _present(path: Path, tables: Path, channel: Channel) -> Channel:
+    """The channel without the records whose file is missing: the sweeps are often not downloaded.
+
+    Raises:
+        DataError: no file is there.
+    """
+    there = [file.exists() for file in _paths(path, tables, channel)]
+    if channel.data and not any(there):
+        expected = f"the files of {channel.name} that {tables.name} names"
+        raise DataError(_paths(path, tables, channel)[0], "no such file", expected)
+    return replace(channel, data=tuple(row for row, here in zip(channel.data, there, strict=True) if here))
+
+
+def _left_out(stored: Channel, present: Channel) -> str:
+    """What of a channel is missing, in words; empty where nothing is."""
+    count = len(stored.data) - len(present.data)
+    return f"{count_of(count, 'file')} of {stored.name} missing and left out" if count else ""
+
+
 def _rig(tables: Path, lidar: Channel, camera: Channel) -> tuple[CameraModel, gtsam.Pose3]:
     """The camera, and cTl by both sensors' poses in the ego vehicle."""
     path = tables / "calibrated_sensor.json"
@@ -258,8 +286,9 @@ def _lidar_files(path: Path, tables: Path, lidar: Channel, options: SourceOption
         position = {text_of(r, "token", data): k for k, r in enumerate(lidar.data)}
         for record in records(lidarseg):
             k = position.get(text_of(record, "sample_data_token", lidarseg))
-            if k is not None:
-                labels[k] = _inside(path, text_of(record, "filename", lidarseg), tables)
+            file = _inside(path, text_of(record, "filename", lidarseg), tables)
+            if k is not None and file.exists():
+                labels[k] = file
     timing = None
     if options.sweep in TURNS:
         if len(stamps_ns) < 2:

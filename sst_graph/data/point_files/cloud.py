@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.data.arrays import MAX_POINTS, check_metres
+from sst_graph.data.point_times import FARTHEST_S, seconds_after_stamp
 from sst_graph.errors import DataError, count_of
 from sst_graph.files.reading import FileKind
 
@@ -22,10 +23,6 @@ RINGS = ("ring", "rings", "channel", "laser_id")
 TIMES = ("time", "times", "t", "timestamp", "time_stamp", "offset_time")
 LABELS = ("label", "labels")
 INTENSITIES = ("intensity", "reflectivity", "reflectance", "remission", "i")
-
-_ABSOLUTE_S = 1e3
-"""Times beyond this [s] are stamps of the LiDAR's clock, not times after the scan's stamp."""
-_LONGEST_S = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +74,7 @@ class Cloud:
     def offsets_s(self, stamp_ns: int, used: NDArray[np.bool_]) -> NDArray[np.float32] | None:
         """Times (n,) of the points after the scan's stamp [s], or None where the cloud has none.
 
-        Whole numbers are nanoseconds, others seconds. Stamps of the LiDAR's clock are made relative.
+        How they are counted: :func:`~sst_graph.data.point_times.seconds_after_stamp`.
 
         Args:
             used: (n,) False for points that are left out, whose times may be anything.
@@ -86,23 +83,19 @@ class Cloud:
             DataError: a time more than a second from the stamp.
         """
         values = self._first(TIMES)
-        if values is None:
+        kept = np.flatnonzero(used)
+        seconds = None if values is None else seconds_after_stamp(values[kept], stamp_ns)
+        if seconds is None:
             return None
-        if values.dtype.kind in "iu":
-            absolute = bool((np.abs(values[used].astype(np.float64)) > _ABSOLUTE_S * 1e9).any())
-            whole = values.astype(np.int64) - (stamp_ns if absolute else 0)
-            seconds = whole.astype(np.float64) * 1e-9
-        else:
-            seconds = values.astype(np.float64)
-            if (np.abs(seconds[used]) > _ABSOLUTE_S).any():
-                seconds = seconds - stamp_ns * 1e-9
-        bad = np.flatnonzero(used & ~(np.abs(seconds) <= _LONGEST_S))
+        bad = kept[~(np.abs(seconds) <= FARTHEST_S)]
         if len(bad):
             times = count_of(len(bad), "time that is", "times that are")
-            found = f"{times} NaN or beyond {_LONGEST_S:g} s, first at index {bad[0]}"
+            found = f"{times} NaN or beyond {FARTHEST_S:g} s, first at index {bad[0]}"
             expected = "seconds in floats or nanoseconds in whole numbers, absolute or after the scan's stamp"
             raise DataError(self.path, found, expected)
-        return np.where(used, seconds, 0.0).astype(np.float32)
+        offsets_s = np.zeros(len(used), np.float32)
+        offsets_s[kept] = seconds
+        return offsets_s
 
     def _first(self, names: tuple[str, ...]) -> NDArray[Any] | None:
         return next((self.fields[name] for name in names if name in self.fields), None)

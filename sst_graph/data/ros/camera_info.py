@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,12 +10,14 @@ import gtsam
 import numpy as np
 
 from sst_graph.cameras import CameraModel
-from sst_graph.cameras.readers import camera_from_camera_info
+from sst_graph.cameras.readers import camera_from_camera_info, check_full_sensor
 from sst_graph.errors import DataError
 from sst_graph.files.checked_values import checked_pose
 
 Size = tuple[int, int]
 """Width, height [px]."""
+
+_RECTIFIED = re.compile(r"(?:^|[/_])rect")
 
 
 @dataclass(frozen=True)
@@ -38,19 +41,20 @@ class ImageGeometry:
 def image_geometry(message: Any, image_topic: str, size: Size, place: str) -> ImageGeometry:
     """Geometry of images of ``size`` by their CameraInfo.
 
-    Images of a topic with "rect" in its name, as image_proc writes them, have the intrinsics of P and the
-    rotation R; all others have those of K and the distortion D.
+    Images of a topic with a word that begins with "rect" in its name, as image_proc writes them, have the
+    intrinsics of P and the rotation R; all others have those of K and the distortion D.
 
     Raises:
         DataError: no calibration, one of another size, or an unknown distortion.
     """
     table = dict(vars(message))
+    check_full_sensor(table, place)
     calibrated = int(table["width"]), int(table["height"])
     if calibrated not in ((0, 0), size):
         expected = f"{size[0]}x{size[1]} px, the size of the images"
         raise DataError(place, f"{calibrated[0]}x{calibrated[1]} px", expected)
     table |= {"width": size[0], "height": size[1]}
-    rectified = "rect" in image_topic and "unrect" not in image_topic
+    rectified = _RECTIFIED.search(image_topic) is not None
     D = table["D"] if "D" in table else table["d"]
     if not len(D):
         # Drivers without a calibrated lens name a model and leave D empty.

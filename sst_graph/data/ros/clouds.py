@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.data.arrays import MAX_POINTS
+from sst_graph.data.point_times import FARTHEST_S, seconds_after_stamp
 from sst_graph.errors import DataError, count_of
 from sst_graph.validation import FARTHEST_M
 
@@ -19,11 +20,6 @@ TIME_FIELDS = ("t", "offset_time", "time", "timestamp", "time_stamp")
 """Fields with the time of a point: of Ouster, Livox, Velodyne, Hesai and RoboSense, Livox's driver 2."""
 RING_FIELDS = ("ring", "channel")
 INTENSITY_FIELDS = ("intensity", "reflectivity")
-
-_ABSOLUTE_S, _ABSOLUTE_NS = 1e6, 1e15
-"""Times beyond these are counted from the epoch, in seconds or nanoseconds (Livox's driver 2)."""
-_FARTHEST_S = 1.0
-"""Points are measured within this of the scan's stamp."""
 
 
 @dataclass(frozen=True)
@@ -143,33 +139,17 @@ def _intensities(table: NDArray[Any]) -> NDArray[np.float32] | None:
 
 
 def _offsets(table: NDArray[Any], stamp_ns: int, place: str) -> NDArray[np.float32] | None:
-    """Times after the stamp [s]: whole numbers are ns; floats are s, relative or since the epoch."""
+    """Times after the stamp [s]."""
     name = next((name for name in TIME_FIELDS if name in _names(table)), None)
-    if name is None or not len(table):
+    seconds = None if name is None else seconds_after_stamp(table[name], stamp_ns)
+    if seconds is None:
         return None
-    values = table[name]
-    if values.dtype.kind in "iu":
-        whole = values.astype(np.int64)
-        relative = whole - stamp_ns if int(np.abs(whole).max()) > _ABSOLUTE_NS else whole
-        seconds = relative * 1e-9
-    else:
-        seconds = _relative(values.astype(np.float64), stamp_ns)
     worst = float(np.abs(seconds).max())
-    if not worst <= _FARTHEST_S:
+    if not worst <= FARTHEST_S:
         found = f"field {name!r} with times up to {worst:.6g} s from the header's stamp"
         expected = "times within 1 s of it (--sweep compensated reads the cloud without them)"
         raise DataError(place, found, expected)
-    return np.asarray(seconds, np.float32)
-
-
-def _relative(times: NDArray[np.float64], stamp_ns: int) -> NDArray[np.float64]:
-    largest = float(np.abs(times).max())
-    if largest > _ABSOLUTE_NS:
-        return (times - float(stamp_ns)) * 1e-9
-    if largest > _ABSOLUTE_S:
-        seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
-        return (times - float(seconds)) - nanoseconds * 1e-9
-    return times
+    return seconds.astype(np.float32)
 
 
 def _labels(table: NDArray[Any]) -> NDArray[np.uint32] | None:

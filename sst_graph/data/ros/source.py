@@ -116,7 +116,7 @@ def open_ros(path: Path, options: SourceOptions) -> Source:
     bag = Bag(path)
     topics = choose_topics(path, bag.topics, options)
     index = read_index(bag, topics, options.stamps)
-    _check_masks(index)
+    _check_masks(bag, index)
     size = _size(bag, topics, index)
     geometry = image_geometry(index.info, topics.image.name, size, f"{path}, {topics.info.name}")
     oTl, reason = index.transforms.pose(index.image_frame, index.cloud_frame)
@@ -148,7 +148,7 @@ def _stamps(stamped: Sequence[Stamped]) -> NDArray[np.int64]:
     return np.array([one.stamp_ns for one in stamped], np.int64)
 
 
-def _check_masks(index: BagIndex) -> None:
+def _check_masks(bag: Bag, index: BagIndex) -> None:
     """A mask belongs to the image that has its stamp.
 
     Raises:
@@ -157,7 +157,8 @@ def _check_masks(index: BagIndex) -> None:
     if index.masks and not np.intersect1d(_stamps(index.masks), _stamps(index.images)).size:
         first = index.masks[0]
         expected = f"the stamps of their images, such as {index.images[0].stamp_ns} ns"
-        raise DataError(first.message.topic, f"masks at other stamps, such as {first.stamp_ns} ns", expected)
+        place = f"{bag.path}, {first.message.topic}"
+        raise DataError(place, f"masks at other stamps, such as {first.stamp_ns} ns", expected)
 
 
 def _size(bag: Bag, topics: Topics, index: BagIndex) -> tuple[int, int]:

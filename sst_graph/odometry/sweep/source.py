@@ -75,7 +75,8 @@ def with_sweep(source: Source, decide: bool = True) -> SweptSource:
         return SweptSource(source, given)
     ahead = AheadReader(source)
     for position in range(len(source)):
-        if (scan := ahead.look(position)) is not None:
+        # A scan without points has no times of them either.
+        if (scan := ahead.look(position)) is not None and len(scan.points):
             if scan.offsets_s is not None:
                 return SweptSource(source, given, ahead)
             break

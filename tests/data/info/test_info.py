@@ -10,10 +10,11 @@ import cv2
 import numpy as np
 import pytest
 
+from sst_graph import open_source
 from sst_graph.cli import main
 from sst_graph.data.info.facts import SensorFacts
 from sst_graph.data.info.methods import METHODS, Content, missing_for
-from sst_graph.data.info.summary import Gap, sensor_info
+from sst_graph.data.info.summary import Gap, drive_info, sensor_info
 
 EVERYTHING = Content(20, 20, True, frozenset({"vehicle", "pole"}), frozenset({"vehicle"}), True)
 
@@ -42,6 +43,25 @@ def test_what_is_missing_for_which_method() -> None:
         "a class that points and masks both have", "a nominal extrinsic (--init none does without)"
     )  # fmt: skip
     assert found["paper"][-1] == "a nominal extrinsic (--init FILE gives a start)"
+
+
+def test_stamps_of_two_clocks_that_share_no_time_are_named(kitti_drive: Path) -> None:
+    times = kitti_drive / "times_2.txt"
+    for later, named in ((0.03, False), (4000.0, True)):
+        times.write_text("".join(f"{later + 0.1 * k}\n" for k in range(5)))
+        found = drive_info(open_source(kitti_drive)).missing
+        sentence = "images of the time of the scans (--init FILE gives the offset between their stamps)"
+        assert {method for method, missing in found.items() if sentence in missing} == (
+            set(METHODS) if named else set()
+        )
+
+
+def test_pictures_of_12_bits_in_16_are_missing_pictures(kitti_drive: Path) -> None:
+    for path in (kitti_drive / "image_2").iterdir():
+        cv2.imwrite(str(path), np.full((6, 8), 4095, np.uint16))
+    found = drive_info(open_source(kitti_drive)).missing
+    words = "pictures that are not black (12 bits kept in 16 are to be made 16 times brighter)"
+    assert {method for method, missing in found.items() if words in missing} == {"edges", "motion", "paper"}
 
 
 def test_text_and_json_of_a_drive(kitti_drive: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -144,6 +144,11 @@ def test_times_before_the_stamp() -> None:
     np.testing.assert_allclose(cloud.offsets_s, -SECONDS, atol=1e-8)
 
 
+@pytest.mark.parametrize("kind", ["<f4", "<f8", "<u4"])
+def test_times_that_are_all_0_are_none(kind: str) -> None:
+    assert read(table(time=np.zeros(5, kind))).offsets_s is None
+
+
 def test_times_of_another_clock_are_refused() -> None:
     with pytest.raises(DataError, match=r"field 'timestamp' with times up to .*--sweep compensated"):
         read(table(timestamp=SECONDS + 1_600_000_000.0))
@@ -241,6 +246,39 @@ def test_intrinsics_of_raw_and_rectified_images() -> None:
     assert rectified.cRo.equals(R, 1e-9)
     ros1 = Messages(is_ros1=True).info(CAMERA)
     assert image_geometry(ros1, "/cam/image_raw", (640, 360), "here").model.intrinsics == CAMERA
+
+
+@pytest.mark.parametrize(
+    ("topic", "rectified"),
+    [
+        ("/cam/image_rect", True),
+        ("/cam/rect/image", True),
+        ("/cam/rectified_image/compressed", True),
+        ("/cam/image_unrect", False),
+        ("/direct/image_raw", False),
+        ("/redirected/image", False),
+    ],
+)
+def test_images_are_rectified_by_a_word_of_their_topic(topic: str, rectified: bool) -> None:
+    info = MAKE.info(CAMERA, p=np.array([650.0, 0, 300, 0, 0, 651, 170, 0, 0, 0, 1, 0]))
+    found = image_geometry(info, topic, (640, 360), "here").model.intrinsics
+    assert (found.fx == 650.0) == rectified
+
+
+def test_binning_is_named_before_the_size_that_follows_from_it() -> None:
+    info = MAKE.info(CAMERA, binning_x=2, binning_y=2)
+    with pytest.raises(
+        DataError, match="binning or a region of interest, expected images of the full sensor"
+    ):
+        image_geometry(info, "/cam/image_raw", (320, 180), "here")
+
+
+def test_a_mask_of_inexact_numbers_is_refused() -> None:
+    data = cv2.imencode(".jpg", np.full((6, 8), 26, np.uint8))[1].tobytes()
+    with pytest.raises(
+        DataError, match="a JPEG picture, whose numbers are not exact, expected a mask as PNG"
+    ):
+        mask_of(MAKE.compressed(STAMP_NS, data, "jpeg"), COMPRESSED, "here")
 
 
 def test_cameras_that_cannot_be_used() -> None:
