@@ -111,7 +111,8 @@ class CalibrationNode:
             sensor.received += 1
             sensor.last_ns = now_ns
             sensor.refuse(
-                f"{sensor.topic}: found {len(data)} bytes that are no {sensor.type_name}: {error}", now_ns
+                f"{sensor.topic}: found no {sensor.type_name} in {count_of(len(data), 'byte')}: {error}",
+                now_ns,
             )
             return []
         match part:

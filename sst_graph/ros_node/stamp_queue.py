@@ -6,7 +6,6 @@ import bisect
 from dataclasses import dataclass, field
 from typing import Any
 
-
 _SET_BACK_NS = 1_000_000_000
 """Stamps so far behind those that are due are of a clock that was set back, as where a bag begins again."""
 

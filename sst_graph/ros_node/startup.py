@@ -1,4 +1,4 @@
-"""The node by its arguments, its parameters, and the signals that end it; needs rclpy."""
+"""The node by its arguments, its parameters, and the signals that end it; what is in it needs rclpy."""
 
 from __future__ import annotations
 
@@ -6,12 +6,6 @@ import dataclasses
 import signal
 import sys
 from typing import Any
-
-import rclpy
-from rcl_interfaces.msg import ParameterDescriptor
-from rclpy.exceptions import NameValidationException
-from rclpy.signals import SignalHandlerOptions
-from rclpy.utilities import remove_ros_args
 
 from sst_graph.errors import ConfigError
 from sst_graph.ros_node.settings import NodeSettings, node_settings, parameter_defaults
@@ -40,11 +34,16 @@ def node_of_arguments() -> Any:
     Raises:
         ConfigError: arguments that ROS does not understand, or that are none of ROS.
     """
+    import rclpy
+    from rclpy.exceptions import NameValidationException
+    from rclpy.signals import SignalHandlerOptions
+    from rclpy.utilities import remove_ros_args
+
     try:
         rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
         node = rclpy.create_node("sst_graph", automatically_declare_parameters_from_overrides=True)
     except ValueError:
-        raise ConfigError("arguments of ROS: found a parameter that is an empty list, expected none") from None
+        raise ConfigError("arguments of ROS: found a parameter that is an empty list") from None
     except (RuntimeError, NameValidationException) as error:
         raise ConfigError(f"arguments of ROS: {' '.join(str(error).split())}") from None
     if others := remove_ros_args(sys.argv)[1:]:
@@ -60,6 +59,8 @@ def read_settings(node: Any) -> tuple[NodeSettings, TrackerConfig]:
     Raises:
         ConfigError: a value that cannot be used.
     """
+    from rcl_interfaces.msg import ParameterDescriptor
+
     values = {}
     for name, default in parameter_defaults().items():
         value = default
@@ -80,8 +81,10 @@ def with_resolved_topics(node: Any, settings: NodeSettings) -> NodeSettings:
     Raises:
         ConfigError: a name that no topic can have.
     """
+    from rclpy.exceptions import NameValidationException
+
     given = {name: value for name, value in dataclasses.asdict(settings).items() if name.endswith("_topic")}
-    found = {}
+    found: dict[str, Any] = {}
     for name, value in given.items():
         try:
             found[name] = node.resolve_topic_name(value) if value else ""

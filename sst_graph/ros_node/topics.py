@@ -1,4 +1,4 @@
-"""Topics that the node listens to and publishes; needs rclpy."""
+"""Topics that the node listens to and publishes; what is in it needs rclpy."""
 
 from __future__ import annotations
 
@@ -7,20 +7,12 @@ from functools import partial
 from importlib import import_module
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.duration import Duration
-from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from std_msgs.msg import String
-from tf2_msgs.msg import TFMessage
-
 from sst_graph.data.ros.messages import MessageMaker
 from sst_graph.ros_node.published import Published
 from sst_graph.ros_node.sensor import SensorRecord
 
-_LATCHED = ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL
-_RELIABLE = ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE
-_BEST_EFFORT = ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE
+_LATCHED, _RELIABLE = ("RELIABLE", "TRANSIENT_LOCAL"), ("RELIABLE", "VOLATILE")
+_BEST_EFFORT = "BEST_EFFORT", "VOLATILE"
 _QUALITIES = {"transforms": (_LATCHED,), "info": (_LATCHED, _RELIABLE, _BEST_EFFORT)}
 _OF_SENSORS = _RELIABLE, _BEST_EFFORT
 """What the publishers of a topic are asked for, the best first."""
@@ -49,7 +41,13 @@ class Subscription:
 
     def listen(self, depth: int) -> None:
         """Begin; at most ``depth`` messages wait to be taken."""
+        from rclpy.event_handler import SubscriptionEventCallbacks
+        from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
         reliability, durability = self._qualities.pop(0)
+        quality = QoSProfile(
+            depth=depth, reliability=ReliabilityPolicy[reliability], durability=DurabilityPolicy[durability]
+        )
         events = SubscriptionEventCallbacks(message_lost=self._lost)
         if self._qualities:
             events.incompatible_qos = partial(self._ask_for_less, depth)
@@ -57,7 +55,7 @@ class Subscription:
             message_class(self._record.type_name),
             self._topic,
             self._take,
-            QoSProfile(depth=depth, reliability=reliability, durability=durability),
+            quality,
             event_callbacks=events,
             raw=True,
         )
@@ -79,9 +77,13 @@ class Publishers:
     """Of status, transforms and diagnostics."""
 
     def __init__(self, node: Any) -> None:
+        from diagnostic_msgs.msg import DiagnosticArray
+        from std_msgs.msg import String
+        from tf2_msgs.msg import TFMessage
+
         self._make = MessageMaker()
         self._publishers = {
-            "status": node.create_publisher(String, "~/status", 10),
+            "status": node.create_publisher(String, "~/status", 100),
             "transforms": node.create_publisher(TFMessage, "/tf", 100),
             "diagnostics": node.create_publisher(DiagnosticArray, "/diagnostics", 10),
         }
@@ -94,6 +96,8 @@ class Publishers:
 
     def wait(self) -> None:
         """Until all has arrived, at most a second for each topic."""
+        from rclpy.duration import Duration
+
         for publisher in self._publishers.values():
             publisher.wait_for_all_acked(Duration(seconds=1))
 

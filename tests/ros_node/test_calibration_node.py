@@ -350,7 +350,7 @@ def test_messages_come_as_bytes(bag: Any, config: TrackerConfig, plain: list[Pub
     found = _diagnostics(node, EPOCH_NS)
     values = {one.key: one.value for one in found["camera"].values}
     assert (values["received"], values["refused"], values["used"]) == ("80", "60", "18")
-    assert f"{IMAGE}: found 40 bytes that are no sensor_msgs/msg/Image" in values["last_error"]
+    assert f"{IMAGE}: found no sensor_msgs/msg/Image in 40 bytes" in values["last_error"]
 
 
 def test_diagnostics_say_what_the_network_shows(config: TrackerConfig) -> None:
