@@ -24,13 +24,15 @@ from release_smoke import found_pythons
 ROOT = Path(__file__).resolve().parent.parent
 PYTHONS = {"kilted": "3.11", "jazzy": "3.12"}
 """The Python that the wheels of a distribution are for."""
+ONLY = {"kilted": ("ament-cmake-ros-core",), "jazzy": ("fastrtps-cmake-module", "python-cmake-module")}
+"""What only the generators of a distribution need."""
 RUN = ("rclpy", "rmw-fastrtps-cpp", "sensor-msgs", "diagnostic-msgs", "geometry-msgs", "std-msgs")
 BUILD = (
     "rosidl-default-generators",
     "rosidl-core-generators",
     "ament-package",
     *(f"ament-cmake{part}" for part in ("", "-include-directories", "-libraries", "-python", "-version")),
-    *(f"ament-cmake{part}" for part in ("-ros", "-ros-core", "-gtest", "-gmock")),
+    *(f"ament-cmake{part}" for part in ("-ros", "-gtest", "-gmock", "-pytest")),
 )
 """What the generators need; the wheels name but some of it."""
 TESTED = ("pytest", "pytest-xdist", "pytest-benchmark", "PyYAML")
@@ -68,7 +70,7 @@ def fitting(parser: argparse.ArgumentParser, distribution: str) -> Path:
 def install(python: Path, distribution: str) -> None:
     """The wheels of ROS, and the checkout with what its tests of the node need."""
     pip = [python, "-m", "pip", "--disable-pip-version-check", "-q", "install", "-c", "constraints.txt"]
-    run([*pip, *(f"ros-{distribution}-{name}" for name in (*RUN, *BUILD))])
+    run([*pip, *(f"ros-{distribution}-{name}" for name in (*RUN, *BUILD, *ONLY[distribution]))])
     run([*pip, "catkin_pkg", *TESTED, "-e", ".[ros]"])
 
 

@@ -30,6 +30,9 @@ from sst_graph.tracker.track_update import TrackUpdate
 from sst_graph.tracker.tracker import Tracker
 from sst_graph.types import CameraImage, Frame, SemanticClass
 
+_BEHIND_S = 1.0
+"""A node whose messages wait longer to be taken is behind."""
+
 
 class CalibrationNode:
     """Takes messages as rosbags decodes them, in the order in which they come; never raises for one.
@@ -171,20 +174,13 @@ class CalibrationNode:
     def tick(self, now_ns: int) -> Published:
         """Diagnostics; to be called once a second or so."""
         sensors = [self.camera, self.lidar, *([self.masks] if self.settings.mask_topic else [])]
+        behind_s = max(one.waited_s for one in sensors)
         found = [one.diagnosis(now_ns, self.settings.silent_s) for one in sensors]
         if self.update is None:
             found.insert(0, Diagnosis("calibration", WARN, self.state, {}))
         else:
             found.insert(0, diagnosis_of(self.update))
-        waiting = {
-            "waiting": len(self._queue),
-            "dropped": self._queue.dropped,
-            "without_partner": self._unpaired,
-        }
-        level = WARN if self._queue.dropped else 0
-        found.append(
-            Diagnosis("queue", level, f"{count_of(self._queue.dropped, 'message')} dropped", waiting)
-        )
+        found.append(self._diagnosis_of_queue(behind_s))
         if self.settings.publish != "none":
             found.append(self._diagnosis_of_tf())
         return Published(diagnostics=self._make.diagnostics(found, now_ns))
@@ -326,6 +322,20 @@ class CalibrationNode:
             self.masks.used += 1
         image = CameraImage(one.stamp_ns, mask, pixels)
         return image if self._rectification is None else self._rectification.image(image)
+
+    def _diagnosis_of_queue(self, behind_s: float) -> Diagnosis:
+        """What waits here, and whether more waits to be taken: for how long is ``behind_s`` [s]."""
+        dropped = self._queue.dropped
+        values = {
+            "waiting": len(self._queue),
+            "dropped": dropped,
+            "without_partner": self._unpaired,
+            "behind_s": f"{behind_s:.1f}",
+        }
+        words = [f"{count_of(dropped, 'message')} dropped"]
+        if behind_s > _BEHIND_S:
+            words.append(f"{behind_s:.1f} s behind: messages come faster than they are used")
+        return Diagnosis("queue", WARN if dropped or len(words) > 1 else OK, "; ".join(words), values)
 
     def _diagnosis_of_tf(self) -> Diagnosis:
         """Whether another node gives the frame that is published a parent: tf allows one."""

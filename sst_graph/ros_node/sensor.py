@@ -24,6 +24,7 @@ class SensorRecord:
         last_ns: when the last message came, by the node's clock [ns].
         error, error_ns: why the last refused message was refused, and when that was.
         lost, lost_ns: messages that the network lost, as the middleware counts them, and when the last was.
+        waited_s: longest that a message since the last diagnosis had waited before it was taken [s].
         published: types that the topic is published as; None where this is not known.
     """
 
@@ -39,6 +40,7 @@ class SensorRecord:
     error_ns: int | None = None
     lost: int = 0
     lost_ns: int | None = None
+    waited_s: float = 0.0
     published: frozenset[str] | None = None
     _diagnosed: int = 0
 
@@ -62,13 +64,17 @@ class SensorRecord:
         self.lost += count
         self.lost_ns = now_ns
 
+    def wait(self, seconds: float) -> None:
+        """Note how long a message waited before it was taken."""
+        self.waited_s = max(self.waited_s, seconds)
+
     def diagnosis(self, now_ns: int, silent_s: float) -> Diagnosis:
         """Silent, in error, or well.
 
         Not silent is a sensor of which a message was taken since the last diagnosis: a node that was busy for
         long has taken none of those that wait.
         """
-        taken, self._diagnosed = self.received > self._diagnosed, self.received
+        taken, self._diagnosed, self.waited_s = self.received > self._diagnosed, self.received, 0.0
         values: dict[str, object] = {
             "topic": self.topic,
             "received": self.received,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from functools import partial
 from importlib import import_module
@@ -54,7 +55,7 @@ class Subscription:
         self._subscription = self._node.create_subscription(
             message_class(self._record.type_name),
             self._topic,
-            self._take,
+            self._taken,
             quality,
             event_callbacks=events,
             raw=True,
@@ -64,6 +65,13 @@ class Subscription:
         """Note as what the topic is published."""
         found = self._node.get_publishers_info_by_topic(self._topic)
         self._record.published = frozenset(one.topic_type for one in found)
+
+    def _taken(self, data: bytes, info: Any) -> None:
+        """Note how long the message waited, and take it."""
+        received_ns = info["received_timestamp"]
+        if received_ns:
+            self._record.wait(1e-9 * (time.time_ns() - received_ns))
+        self._take(data)
 
     def _ask_for_less(self, depth: int, event: Any) -> None:
         self._node.destroy_subscription(self._subscription)

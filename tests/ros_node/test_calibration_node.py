@@ -281,7 +281,7 @@ def test_queues_are_bounded(bag: Any, config: TrackerConfig) -> None:
     _play(node, [one for one in messages if one[0] in (CLOUD, IMAGE)])
     values = {one.key: one.value for one in _diagnostics(node, EPOCH_NS)["queue"].values}
     # Without camera_info nothing is used; images wait for masks.
-    assert values == {"waiting": "4", "dropped": "16", "without_partner": "16"}
+    assert values == {"waiting": "4", "dropped": "16", "without_partner": "16", "behind_s": "0.0"}
     # Too many to wait for hold_s: the oldest are used before that.
     hasty = CalibrationNode(dataclasses.replace(settings, hold_s=10.0), config)
     assert len(_play(hasty, messages)) == 18
@@ -368,6 +368,12 @@ def test_diagnostics_say_what_the_network_shows(config: TrackerConfig) -> None:
     node.lidar.lose(3, EPOCH_NS)
     lidar = _diagnostics_of(node, EPOCH_NS, "car/tracker: lidar")
     assert (lidar.level, lidar.message) == (1, "3 messages lost by the network")
+    # A node that is behind says so once.
+    node.lidar.wait(2.5)
+    node.lidar.wait(0.5)
+    for level, words in ((1, "0 messages dropped; 2.5 s behind: messages come"), (0, "0 messages dropped")):
+        queue = _diagnostics_of(node, EPOCH_NS, "car/tracker: queue")
+        assert queue.level == level and queue.message.startswith(words)
     # Long ago, or later than now where the clock was set back.
     for now_ns in (EPOCH_NS + 6 * 10**9, EPOCH_NS - 10**9):
         node.lidar.last_ns = now_ns
