@@ -63,7 +63,8 @@ if __name__ == "__main__":
     try:
         main()
     except ModuleNotFoundError as missing:
-        raise SystemExit(f"sst_graph.ros_node: {missing.name} is not installed: source ROS 2 first") from None
+        todo = "pip install 'sst-graph[ros]'" if missing.name == "rosbags" else "source ROS 2 first"
+        raise SystemExit(f"sst_graph.ros_node: {missing.name} is not installed: {todo}") from None
     except SstGraphError as error:
         why = str(error).removeprefix("NodeSettings.")
         raise SystemExit(f"sst_graph.ros_node: {why}") from None
