@@ -23,8 +23,8 @@ class Subscription:
     """Messages of a topic as bytes, in the best quality of service that its publishers offer.
 
     The middleware reports a publisher that offers less than is asked for; then the next quality is asked
-    for. Best effort alone would fit all of them, and lose most pictures and clouds of more than half a
-    megabyte, which are sent in pieces.
+    for. Best effort alone would fit all of them, and lose pictures and clouds of more than half a megabyte,
+    which are sent in pieces.
     """
 
     def __init__(
