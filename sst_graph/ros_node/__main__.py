@@ -2,77 +2,69 @@
 
 from __future__ import annotations
 
-import dataclasses
 from functools import partial
-from typing import Any
 
-from sst_graph.config import with_overrides
-from sst_graph.ros_node.calibration_node import CalibrationNode, image_type
-from sst_graph.ros_node.published import NodeMessages, Published
-from sst_graph.ros_node.settings import NodeSettings
-from sst_graph.tracker.config import TrackerConfig
+from sst_graph.errors import SstGraphError
+from sst_graph.ros_node.calibration_node import CalibrationNode
 
 
 def main() -> None:
-    """Spin until ROS shuts down."""
-    import rclpy
-    from diagnostic_msgs.msg import DiagnosticArray
-    from rclpy.executors import ExternalShutdownException
-    from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
-    from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
-    from std_msgs.msg import String
-    from tf2_msgs.msg import TFMessage
+    """Work until SIGINT or SIGTERM; then use what waits, solve the whole window, and publish that."""
+    from rclpy.clock import Clock, ClockType
+    from rclpy.executors import SingleThreadedExecutor
 
-    rclpy.init()
-    node = rclpy.create_node("sst_graph")
-    values = {k: node.declare_parameter(k, v).value for k, v in dataclasses.asdict(NodeSettings()).items()}
-    overrides = node.declare_parameter("tracker_settings", [""]).value
-    config = with_overrides(TrackerConfig(), [one for one in overrides if one])
-    core, make = CalibrationNode(NodeSettings(**values), config), NodeMessages()
-    publishers = {
-        "status": node.create_publisher(String, "~/status", 10),
-        "transforms": node.create_publisher(TFMessage, "/tf", 100),
-        "diagnostics": node.create_publisher(DiagnosticArray, "/diagnostics", 10),
-    }
+    from sst_graph.ros_node.startup import node_of_arguments, read_settings, stopping, with_resolved_topics
+    from sst_graph.ros_node.topics import Publishers, Subscription
 
-    def publish(published: Published) -> None:
-        for name, publisher in publishers.items():
-            if (message := getattr(published, name)) is not None:
-                publisher.publish(make.encoded(message))
+    # 1. The node and its core, by the parameters.
+    stops = stopping()
+    node = node_of_arguments()
+    settings, config = read_settings(node)
+    name = node.get_fully_qualified_name().lstrip("/")
+    core = CalibrationNode(with_resolved_topics(node, settings), config, name)
+    # 2. What is published comes of messages, and of a timer that runs where /clock stands still.
+    publishers = Publishers(node)
 
     def now_ns() -> int:
         return int(node.get_clock().now().nanoseconds)
 
-    def take(add: Any, type_name: str, data: bytes) -> None:
-        for published in add(make.decoded(data, type_name), now_ns()) or ():
-            publish(published)
+    def take(part: str, data: bytes) -> None:
+        for published in core.add_bytes(part, data, now_ns()):
+            publishers.publish(published)
 
-    def listen(topic: str, kind: Any, add: Any, qos: Any = qos_profile_sensor_data) -> None:
-        type_name = f"{kind.__module__.partition('.')[0]}/msg/{kind.__name__}"
-        node.create_subscription(kind, topic, partial(take, add, type_name), qos, raw=True)
+    def tick() -> None:
+        for one in subscriptions:
+            one.look()
+        publishers.publish(core.tick(now_ns()))
+        if news := core.news():
+            node.get_logger().info(news)
 
-    for topic, add in ((core.camera.topic, core.add_image), (core.masks.topic, core.add_mask)):
-        if topic:
-            compressed = image_type(topic).endswith("CompressedImage")
-            kind = CompressedImage if compressed else Image
-            listen(topic, kind, partial(add, type_name=image_type(topic)))
-    listen(core.lidar.topic, PointCloud2, core.add_cloud)
-    listen(core.settings.info_topic, CameraInfo, core.add_info)
-    latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    listen("/tf_static", TFMessage, core.add_transforms, latched)
-    node.create_timer(1.0, lambda: publish(core.tick(now_ns())))
-    try:
-        rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    finally:
-        node.destroy_node()
-        if rclpy.ok():
-            rclpy.shutdown()
+    subscriptions = []
+    for part, record in core.topics.items():
+        topic = getattr(settings, f"{part}_topic", record.topic)
+        subscriptions.append(Subscription(node, part, topic, record, partial(take, part)))
+        subscriptions[-1].listen(settings.queue)
+    node.create_timer(1.0, tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+    # 3. Work.
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    while not stops:
+        executor.spin_once(timeout_sec=0.2)
+    # 4. The end.
+    for published in core.finish(now_ns()):
+        publishers.publish(published)
+    tick()
+    publishers.wait()
+    node.destroy_node()
+    executor.shutdown()
 
 
 if __name__ == "__main__":
     try:
         main()
     except ModuleNotFoundError as missing:
-        raise SystemExit(f"sst_graph.ros_node: {missing.name} is not installed: source ROS 2 first") from None
+        todo = "pip install 'sst-graph[ros]'" if missing.name == "rosbags" else "source ROS 2 first"
+        raise SystemExit(f"sst_graph.ros_node: {missing.name} is not installed: {todo}") from None
+    except SstGraphError as error:
+        why = str(error).removeprefix("NodeSettings.")
+        raise SystemExit(f"sst_graph.ros_node: {why}") from None

@@ -11,15 +11,16 @@ import numpy as np
 
 from sst_graph.cameras import Rectification
 from sst_graph.classes import MaskEncoding
+from sst_graph.data.ros.bag import TF_MESSAGE
 from sst_graph.data.ros.camera_info import ImageGeometry, image_geometry
 from sst_graph.data.ros.frames import CloudReading, check_size, mask_classes, scan_of
 from sst_graph.data.ros.images import picture_of
-from sst_graph.data.ros.topics import COMPRESSED, IMAGE
+from sst_graph.data.ros.topics import CLOUD, COMPRESSED, IMAGE, INFO
 from sst_graph.data.ros.transforms import Transforms
 from sst_graph.data.source import TURNS
 from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.reference import load_initial
-from sst_graph.ros_node.published import WARN, Diagnosis, NodeMessages, Published, diagnosis_of
+from sst_graph.ros_node.published import OK, WARN, Diagnosis, NodeMessages, Published, diagnosis_of
 from sst_graph.ros_node.sensor import SensorRecord
 from sst_graph.ros_node.settings import INIT_NONE, INIT_TF, NodeSettings
 from sst_graph.ros_node.stamp_queue import StampQueue, Waiting
@@ -29,6 +30,9 @@ from sst_graph.tracker.track_update import TrackUpdate
 from sst_graph.tracker.tracker import Tracker
 from sst_graph.types import CameraImage, Frame, SemanticClass
 
+_BEHIND_S = 1.0
+"""A node whose messages wait longer to be taken is behind."""
+
 
 class CalibrationNode:
     """Takes messages as rosbags decodes them, in the order in which they come; never raises for one.
@@ -36,13 +40,19 @@ class CalibrationNode:
     Each method gives what is to be published. ``now_ns`` is the node's clock [ns].
 
     Attributes:
-        camera, lidar, masks: what came of each sensor.
+        camera, lidar, masks, info, transforms: what came of each sensor, and on the topics beside them.
         tracker: None until camera, first image and start are known.
         update: the tracker's last.
     """
 
-    def __init__(self, settings: NodeSettings, config: TrackerConfig | None = None) -> None:
-        """config: of the tracker.
+    def __init__(
+        self, settings: NodeSettings, config: TrackerConfig | None = None, name: str = "sst_graph"
+    ) -> None:
+        """
+        Args:
+            settings: topics by the names that they have in the graph of ROS.
+            config: of the tracker.
+            name: of the node, with which the names of its diagnostics begin.
 
         Raises:
             ConfigError, DataError: a parameter that cannot be used.
@@ -56,12 +66,14 @@ class CalibrationNode:
         given = settings.init not in (INIT_TF, INIT_NONE)
         # A node has one camera, whose name in the data that the file was made of is another matter.
         self._given = load_initial(Path(settings.init), None) if given else None
-        self.camera = SensorRecord("camera", settings.image_topic)
-        self.lidar = SensorRecord("lidar", settings.cloud_topic)
-        self.masks = SensorRecord("masks", settings.mask_topic)
+        self.camera = SensorRecord("camera", settings.image_topic, image_type(settings.image_topic))
+        self.lidar = SensorRecord("lidar", settings.cloud_topic, CLOUD)
+        self.masks = SensorRecord("masks", settings.mask_topic, image_type(settings.mask_topic))
+        self.info = SensorRecord("camera_info", settings.info_topic, INFO)
+        self.transforms = SensorRecord("transforms", "/tf_static", TF_MESSAGE)
         self.tracker: Tracker | None = None
         self.update: TrackUpdate | None = None
-        self._make = NodeMessages()
+        self._make = NodeMessages(name)
         self._queue = StampQueue(settings.hold_s, settings.queue)
         self._halves: dict[int, dict[str, tuple[Any, str]]] = {}
         self._unpaired = 0
@@ -69,9 +81,55 @@ class CalibrationNode:
         self._geometry: ImageGeometry | None = None
         self._rectification: Rectification | None = None
         self._transforms = Transforms()
-        self._waiting_for = "no camera_info yet"
+        self._waiting_for = self._told = ""
+
+    @property
+    def topics(self) -> dict[str, SensorRecord]:
+        """What is listened to, by the part that it has here: image, mask, cloud, info, transforms."""
+        found = {"image": self.camera, "cloud": self.lidar, "info": self.info, "transforms": self.transforms}
+        return found | ({"mask": self.masks} if self.settings.mask_topic else {})
+
+    @property
+    def state(self) -> str:
+        """The tracker's status; what the node waits for, where there is none yet."""
+        if self.update is not None:
+            return self.update.status
+        return self.info.error or self.info.missing if self._info is None else self._waiting_for
+
+    def news(self) -> str:
+        """The state and its reason where the state has changed since the last call, else ''; for the log."""
+        if self.state == self._told:
+            return ""
+        self._told = self.state
+        return self.state if self.update is None else diagnosis_of(self.update).message
 
     # ------------------------------------------------------------------ messages
+
+    def add_bytes(self, part: str, data: bytes, now_ns: int) -> list[Published]:
+        """A message as it comes from the network; ``part`` is a key of :attr:`topics`."""
+        sensor = self.topics[part]
+        try:
+            message = self._make.decoded(data, sensor.type_name)
+        except Exception as error:
+            sensor.received += 1
+            sensor.last_ns = now_ns
+            sensor.refuse(
+                f"{sensor.topic}: found no {sensor.type_name} in {count_of(len(data), 'byte')}: {error}",
+                now_ns,
+            )
+            return []
+        match part:
+            case "image":
+                return self.add_image(message, now_ns, sensor.type_name)
+            case "mask":
+                return self.add_mask(message, now_ns, sensor.type_name)
+            case "cloud":
+                return self.add_cloud(message, now_ns)
+            case "info":
+                self.add_info(message, now_ns)
+            case _:
+                self.add_transforms(message, now_ns)
+        return []
 
     def add_image(self, message: Any, now_ns: int, type_name: str = IMAGE) -> list[Published]:
         """An Image or CompressedImage."""
@@ -116,20 +174,15 @@ class CalibrationNode:
     def tick(self, now_ns: int) -> Published:
         """Diagnostics; to be called once a second or so."""
         sensors = [self.camera, self.lidar, *([self.masks] if self.settings.mask_topic else [])]
+        behind_s = max(one.waited_s for one in sensors)
         found = [one.diagnosis(now_ns, self.settings.silent_s) for one in sensors]
         if self.update is None:
-            found.insert(0, Diagnosis("calibration", WARN, self._waiting_for, {}))
+            found.insert(0, Diagnosis("calibration", WARN, self.state, {}))
         else:
             found.insert(0, diagnosis_of(self.update))
-        waiting = {
-            "waiting": len(self._queue),
-            "dropped": self._queue.dropped,
-            "without_partner": self._unpaired,
-        }
-        level = WARN if self._queue.dropped else 0
-        found.append(
-            Diagnosis("queue", level, f"{count_of(self._queue.dropped, 'message')} dropped", waiting)
-        )
+        found.append(self._diagnosis_of_queue(behind_s))
+        if self.settings.publish != "none":
+            found.append(self._diagnosis_of_tf())
         return Published(diagnostics=self._make.diagnostics(found, now_ns))
 
     def finish(self, now_ns: int) -> list[Published]:
@@ -171,7 +224,8 @@ class CalibrationNode:
         if len(halves) == 2:
             self._queue.add(stamp_ns, False, self._halves.pop(stamp_ns))
         while len(self._halves) > self.settings.queue:
-            del self._halves[min(self._halves)]
+            # The first that came: stamps go back where a bag begins again.
+            del self._halves[next(iter(self._halves))]
             self._unpaired += 1
 
     def _work(self, now_ns: int, at_end: bool = False) -> list[Published]:
@@ -190,7 +244,7 @@ class CalibrationNode:
         """Make the tracker, as soon as the camera, the first image and the start are known."""
         first = next((one for one in self._queue.peek() if not one.is_scan), None)
         if self._info is None or first is None:
-            self._waiting_for = "no camera_info yet" if self._info is None else "no image yet"
+            self._waiting_for = "no image with a mask yet" if self._halves else "no image yet"
             return False
         try:
             if self._geometry is None:
@@ -268,6 +322,32 @@ class CalibrationNode:
             self.masks.used += 1
         image = CameraImage(one.stamp_ns, mask, pixels)
         return image if self._rectification is None else self._rectification.image(image)
+
+    def _diagnosis_of_queue(self, behind_s: float) -> Diagnosis:
+        """What waits here, and whether more waits to be taken: for how long is ``behind_s`` [s]."""
+        dropped = self._queue.dropped
+        values = {
+            "waiting": len(self._queue),
+            "dropped": dropped,
+            "without_partner": self._unpaired,
+            "behind_s": f"{behind_s:.1f}",
+        }
+        words = [f"{count_of(dropped, 'message')} dropped"]
+        if behind_s > _BEHIND_S:
+            words.append(f"{behind_s:.1f} s behind: messages come faster than they are used")
+        return Diagnosis("queue", WARN if dropped or len(words) > 1 else OK, "; ".join(words), values)
+
+    def _diagnosis_of_tf(self) -> Diagnosis:
+        """Whether another node gives the frame that is published a parent: tf allows one."""
+        names = self.camera.frame, self.lidar.frame
+        parent, child = names if self.settings.parent == "camera" else names[::-1]
+        others = self._transforms.parents(child)
+        if not others:
+            return Diagnosis("tf", OK, f"{child} in {parent}" if parent and child else "no frames yet", {})
+        words = (
+            f"{child} is in {', '.join(others)} already (/tf_static): set publish to none, or take that out"
+        )
+        return Diagnosis("tf", WARN, words, {})
 
     def _published(self, update: TrackUpdate) -> Published:
         self.update = update

@@ -44,7 +44,15 @@ class Diagnosis:
 
 
 class NodeMessages(MessageMaker):
-    """Makes the messages of ROS 2 that the node publishes."""
+    """Makes the messages of ROS 2 that the node publishes.
+
+    Args:
+        node_name: what the names of the diagnostics begin with.
+    """
+
+    def __init__(self, node_name: str) -> None:
+        super().__init__()
+        self.node_name = node_name
 
     def status(self, update: TrackUpdate) -> Any:
         """String of an update."""
@@ -56,7 +64,7 @@ class NodeMessages(MessageMaker):
             self.make(
                 "diagnostic_msgs/msg/DiagnosticStatus",
                 level=one.level,
-                name=f"sst_graph: {one.name}",
+                name=f"{self.node_name}: {one.name}",
                 message=one.message,
                 hardware_id="",
                 values=[

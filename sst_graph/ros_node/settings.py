@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sst_graph.config import Settings, setting
+from sst_graph.config import Settings, setting, with_overrides
 from sst_graph.data.source import TURNS
 from sst_graph.errors import ConfigError
+from sst_graph.tracker.config import TrackerConfig
 
 INIT_TF, INIT_NONE = "tf", "none"
 
@@ -53,6 +56,30 @@ class NodeSettings(Settings):
         for name in ("image_topic", "info_topic", "cloud_topic", "init"):
             if not getattr(self, name):
                 raise ConfigError(f"{name}: found an empty name, expected one")
+
+
+def parameter_defaults() -> dict[str, Any]:
+    """All parameters of the node with their defaults, in the types of ROS."""
+    return {**dataclasses.asdict(NodeSettings()), "tracker_settings": [""]}
+
+
+def node_settings(parameters: Mapping[str, Any]) -> tuple[NodeSettings, TrackerConfig]:
+    """Settings of the node and of its tracker by the values of ROS parameters.
+
+    Raises:
+        ConfigError: an unknown name, or a value that cannot be used.
+    """
+    values = dict(parameters)
+    overrides = values.pop("tracker_settings", [])
+    listed = [overrides] if isinstance(overrides, str) else list(overrides)
+    if not all(isinstance(one, str) for one in listed):
+        raise ConfigError(f'tracker_settings: found {listed}, expected texts, ["name=value"]')
+    if unknown := sorted(set(values) - set(parameter_defaults())):
+        raise ConfigError(
+            f"found a parameter {unknown[0]!r}, expected one of {', '.join(parameter_defaults())}"
+        )
+    config = with_overrides(TrackerConfig(), [one for one in listed if one])
+    return NodeSettings(**values), config
 
 
 def _one_of(name: str, value: Any, names: tuple[str, ...]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import json
 import subprocess
 import sys
@@ -25,6 +26,7 @@ from sst_graph.cli import main
 from sst_graph.data import KittiSource, open_source
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.ros_node import CalibrationNode, NodeSettings, Published
+from sst_graph.ros_node.settings import node_settings, parameter_defaults
 from sst_graph.tracker.config import TrackerConfig
 
 SETTINGS = NodeSettings(
@@ -94,6 +96,11 @@ def _diagnostics(node: CalibrationNode, now_ns: int) -> dict[str, Any]:
     return {one.name.removeprefix("sst_graph: "): one for one in array.status}
 
 
+def _diagnostics_of(node: CalibrationNode, now_ns: int, name: str) -> Any:
+    """One of the node's statuses by its whole name."""
+    return next(one for one in node.tick(now_ns).diagnostics.status if one.name == name)
+
+
 @pytest.mark.slow
 def test_it_ends_where_track_ends(
     bag: Any, plain: list[Published], capsys: pytest.CaptureFixture[str]
@@ -135,7 +142,10 @@ def test_the_transform_is_the_calibration(bag: Any, config: TrackerConfig, plain
 def test_what_is_published_can_be_serialized(bag: Any, config: TrackerConfig) -> None:
     from sst_graph.ros_node.published import NodeMessages
 
-    node, make = CalibrationNode(dataclasses.replace(SETTINGS, publish="latest"), config), NodeMessages()
+    node, make = (
+        CalibrationNode(dataclasses.replace(SETTINGS, publish="latest"), config),
+        NodeMessages("sst_graph"),
+    )
     last = _play(node, _messages(bag)[:FEW])[-1]
     for message in (last.status, last.transforms, node.tick(EPOCH_NS).diagnostics):
         again = make.decoded(make.encoded(message), message.__msgtype__)
@@ -146,10 +156,10 @@ def test_diagnostics_say_what_is_missing(bag: Any, config: TrackerConfig) -> Non
     node = CalibrationNode(SETTINGS, config)
     empty = _diagnostics(node, EPOCH_NS)
     assert empty["camera"].level == empty["lidar"].level == empty["masks"].level == 3
-    assert empty["calibration"].message == "no camera_info yet"
+    assert empty["calibration"].message == f"no message on {INFO} yet"
     messages = _messages(bag)
     _play(node, [one for one in messages if one[0] not in ("/tf_static", INFO)][:12])
-    assert _diagnostics(node, EPOCH_NS)["calibration"].message == "no camera_info yet"
+    assert _diagnostics(node, EPOCH_NS)["calibration"].message == f"no message on {INFO} yet"
     _play(node, [one for one in messages if one[0] == INFO])
     assert node.tracker is None
     _play(node, [one for one in messages if one[0] == CLOUD][:5])
@@ -172,6 +182,8 @@ def test_a_silent_sensor_is_named_and_the_tracker_goes_on(bag: Any, config: Trac
     half = [one for one in gap if one[2] <= middle + 5e8]
     published = _play(node, half)
     now_ns = half[-1][2] + 1_500_000_000
+    # A node that was busy for so long does not know yet whether messages wait.
+    assert _diagnostics(node, now_ns)["lidar"].level == 0
     silent = _diagnostics(node, now_ns)
     assert silent["camera"].level == 3 and "for 2." in silent["camera"].message
     assert silent["lidar"].level == 3 and "for 1.5 s" in silent["lidar"].message
@@ -269,7 +281,7 @@ def test_queues_are_bounded(bag: Any, config: TrackerConfig) -> None:
     _play(node, [one for one in messages if one[0] in (CLOUD, IMAGE)])
     values = {one.key: one.value for one in _diagnostics(node, EPOCH_NS)["queue"].values}
     # Without camera_info nothing is used; images wait for masks.
-    assert values == {"waiting": "4", "dropped": "16", "without_partner": "16"}
+    assert values == {"waiting": "4", "dropped": "16", "without_partner": "16", "behind_s": "0.0"}
     # Too many to wait for hold_s: the oldest are used before that.
     hasty = CalibrationNode(dataclasses.replace(settings, hold_s=10.0), config)
     assert len(_play(hasty, messages)) == 18
@@ -292,6 +304,120 @@ def test_wrong_parameters_are_refused(changes: dict[str, Any]) -> None:
         CalibrationNode(dataclasses.replace(SETTINGS, **changes))
 
 
+@pytest.mark.parametrize(
+    ("given", "tracker_settings"),
+    [
+        ({"hold_s": 1, "tracker_settings": ["window=40", "start_scans=8"]}, (40, 8)),
+        ({"tracker_settings": "window=30"}, (30, TrackerConfig().start_scans)),
+        ({"tracker_settings": [""]}, (TrackerConfig().window, TrackerConfig().start_scans)),
+    ],
+)
+def test_parameters_are_of_the_kinds_that_ros_reads(
+    given: dict[str, Any], tracker_settings: tuple[int, int]
+) -> None:
+    """A whole number in the place of another, a single setting without brackets."""
+    settings, config = node_settings(given)
+    assert settings.hold_s == given.get("hold_s", 0.2) and isinstance(settings.hold_s, float)
+    assert (config.window, config.start_scans) == tracker_settings
+    assert parameter_defaults().keys() >= given.keys()
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"tracker_settings": [1, 2]}, "tracker_settings: found"),
+        ({"tracker_settings": ["windo=4"]}, "unknown setting 'windo'"),
+        ({"mask_topic": True}, "mask_topic: found True, expected text"),
+        ({"image_topics": "x"}, "found a parameter 'image_topics', expected one of image_topic"),
+    ],
+)
+def test_parameters_of_other_kinds_are_refused(given: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        node_settings(given)
+
+
+def test_messages_come_as_bytes(bag: Any, config: TrackerConfig, plain: list[Published]) -> None:
+    """Those of another type, or cut short, are refused, and nothing else changes."""
+    node, make = CalibrationNode(SETTINGS, config), Messages()
+    parts = {record.topic: part for part, record in node.topics.items()}
+    published: list[Published] = []
+    for topic, _, now_ns, message in _messages(bag):
+        data = make.encoded(message)
+        for broken in (b"", data[: len(data) // 2], b"\xff" * 40):
+            assert node.add_bytes(parts[topic], broken, now_ns) == []
+        published += node.add_bytes(parts[topic], data, now_ns)
+    assert [_line(one) for one in published] == [_line(one) for one in plain[: len(published)]]
+    found = _diagnostics(node, EPOCH_NS)
+    values = {one.key: one.value for one in found["camera"].values}
+    assert (values["received"], values["refused"], values["used"]) == ("80", "60", "18")
+    assert f"{IMAGE}: found no sensor_msgs/msg/Image in 40 bytes" in values["last_error"]
+
+
+def test_diagnostics_say_what_the_network_shows(config: TrackerConfig) -> None:
+    node = CalibrationNode(SETTINGS, config, "car/tracker")
+    node.camera.published = frozenset({"sensor_msgs/msg/CompressedImage"})
+    node.lidar.published = frozenset()
+    node.info.published = frozenset({"sensor_msgs/msg/CameraInfo"})
+    found = {one.name: one.message for one in node.tick(EPOCH_NS).diagnostics.status}
+    wrong = "it is published as sensor_msgs/msg/CompressedImage, not sensor_msgs/msg/Image"
+    assert found["car/tracker: camera"] == f"no message on {IMAGE} yet: {wrong}"
+    assert found["car/tracker: lidar"] == f"no message on {CLOUD} yet: nothing publishes it"
+    assert found["car/tracker: calibration"] == node.news() == f"no message on {INFO} yet"
+    assert node.news() == ""
+    node.lidar.received, node.lidar.last_ns = 1, EPOCH_NS
+    node.lidar.lose(3, EPOCH_NS)
+    lidar = _diagnostics_of(node, EPOCH_NS, "car/tracker: lidar")
+    assert (lidar.level, lidar.message) == (1, "3 messages lost by the network")
+    # A node that is behind says so once.
+    node.lidar.wait(2.5)
+    node.lidar.wait(0.5)
+    for level, words in ((1, "0 messages dropped; 2.5 s behind: messages come"), (0, "0 messages dropped")):
+        queue = _diagnostics_of(node, EPOCH_NS, "car/tracker: queue")
+        assert queue.level == level and queue.message.startswith(words)
+    # Long ago, or later than now where the clock was set back.
+    for now_ns in (EPOCH_NS + 6 * 10**9, EPOCH_NS - 10**9):
+        node.lidar.last_ns = now_ns
+        assert _diagnostics_of(node, now_ns, "car/tracker: lidar").level == 0
+
+
+def test_a_frame_with_another_parent_is_warned_of(bag: Any, config: TrackerConfig) -> None:
+    for changes, words in (
+        ({}, f"{LIDAR_FRAME} is in mast already"),
+        ({"parent": "lidar"}, f"{CAMERA_FRAME} is in base_link already"),
+    ):
+        node = CalibrationNode(dataclasses.replace(SETTINGS, **changes), config)
+        assert _diagnostics(node, EPOCH_NS)["tf"].level == 0
+        _play(node, _messages(bag)[:5])
+        warned = _diagnostics(node, EPOCH_NS)["tf"]
+        assert warned.level == 1 and words in warned.message
+    silent = CalibrationNode(dataclasses.replace(SETTINGS, publish="none"), config)
+    _play(silent, _messages(bag)[:5])
+    assert "tf" not in _diagnostics(silent, EPOCH_NS)
+
+
+def test_a_bag_that_begins_again(bag: Any, config: TrackerConfig) -> None:
+    """The end of the first play is used before the second, in which the order is that of the stamps again."""
+    messages = _messages(bag)
+    node = CalibrationNode(SETTINGS, config)
+    # More masks without an image than may wait for one: they stand in nobody's way.
+    mask = next(one[3] for one in messages if one[0] == MASK)
+    for k in range(SETTINGS.queue + 5):
+        late = Messages().header(EPOCH_NS + 10**12 + k, CAMERA_FRAME)
+        node.add_mask(dataclasses.replace(mask, header=late), EPOCH_NS)
+    first = [_line(one)["stamp_ns"] for one in _play(node, messages)]
+    second = [_line(one) for one in _play(node, messages) + node.finish(EPOCH_NS)]
+    stamps = [line["stamp_ns"] for line in second]
+    scans = sorted(
+        {one[3].header.stamp.nanosec + one[3].header.stamp.sec * 10**9 for one in messages if one[0] == CLOUD}
+    )
+    assert first == scans[:18] and stamps[:2] == scans[18:]
+    again = stamps[2:]
+    assert again == sorted(again) and set(again) == set(scans)
+    # The clock was set back, which is an alarm; then there is an estimate again.
+    assert any(line["alarm"] for line in second) and second[-1]["matches"] > 50
+
+
+@pytest.mark.skipif(importlib.util.find_spec("rclpy") is not None, reason="rclpy is installed")
 def test_the_wrapper_is_short_and_needs_rclpy_only_to_run() -> None:
     import sst_graph.ros_node.__main__ as wrapper
 

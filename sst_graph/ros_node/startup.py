@@ -1,0 +1,93 @@
+"""The node by its arguments, its parameters, and the signals that end it; what is in it needs rclpy."""
+
+from __future__ import annotations
+
+import dataclasses
+import signal
+import sys
+from typing import Any
+
+from sst_graph.errors import ConfigError
+from sst_graph.ros_node.settings import NodeSettings, node_settings, parameter_defaults
+from sst_graph.tracker.config import TrackerConfig
+
+_OF_ROS = {"use_sim_time", "start_type_description_service"}
+"""Parameters that every node has."""
+
+
+def stopping() -> list[int]:
+    """A list that is empty until SIGINT or SIGTERM comes; a second one ends the process at once."""
+    stops: list[int] = []
+
+    def stop(number: int, _: Any) -> None:
+        stops.append(number)
+        signal.signal(number, signal.SIG_DFL)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stop)
+    return stops
+
+
+def node_of_arguments() -> Any:
+    """The node, which leaves signals alone.
+
+    Raises:
+        ConfigError: arguments that ROS does not understand, or that are none of ROS.
+    """
+    import rclpy
+    from rclpy.exceptions import NameValidationException
+    from rclpy.signals import SignalHandlerOptions
+    from rclpy.utilities import remove_ros_args
+
+    try:
+        rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
+        node = rclpy.create_node("sst_graph", automatically_declare_parameters_from_overrides=True)
+    except ValueError:
+        raise ConfigError("arguments of ROS: found a parameter that is an empty list") from None
+    except (RuntimeError, NameValidationException) as error:
+        raise ConfigError(f"arguments of ROS: {' '.join(str(error).split())}") from None
+    if others := remove_ros_args(sys.argv)[1:]:
+        raise ConfigError(f"found {' '.join(others)}, expected parameters, --ros-args -p name:=value")
+    return node
+
+
+def read_settings(node: Any) -> tuple[NodeSettings, TrackerConfig]:
+    """Settings of node and tracker by the node's parameters, which cannot be changed from then on.
+
+    Those of other names are warned of: a file of parameters may be that of several nodes.
+
+    Raises:
+        ConfigError: a value that cannot be used.
+    """
+    from rcl_interfaces.msg import ParameterDescriptor
+
+    values = {}
+    for name, default in parameter_defaults().items():
+        value = default
+        if node.has_parameter(name):
+            value = node.get_parameter(name).value
+            node.undeclare_parameter(name)
+        fixed = ParameterDescriptor(read_only=True, dynamic_typing=True)
+        values[name] = node.declare_parameter(name, value, fixed).value
+    for name in sorted(node.get_parameters_by_prefix("")):
+        if name not in values and name not in _OF_ROS and not name.startswith("qos_overrides."):
+            node.get_logger().warning(f"parameter {name} is none of this node and is not used")
+    return node_settings(values)
+
+
+def with_resolved_topics(node: Any, settings: NodeSettings) -> NodeSettings:
+    """``settings`` with the names that the topics have in the graph: in the namespace, and remapped.
+
+    Raises:
+        ConfigError: a name that no topic can have.
+    """
+    from rclpy.exceptions import NameValidationException
+
+    given = {name: value for name, value in dataclasses.asdict(settings).items() if name.endswith("_topic")}
+    found: dict[str, Any] = {}
+    for name, value in given.items():
+        try:
+            found[name] = node.resolve_topic_name(value) if value else ""
+        except (RuntimeError, ValueError, NameValidationException) as error:
+            raise ConfigError(f"{name}: found {value!r}: {' '.join(str(error).split())}") from None
+    return dataclasses.replace(settings, **found)
