@@ -50,7 +50,7 @@ LITTLE_MEMORY = """
 import resource, sys
 from sst_graph.cli import main
 import sst_graph.cli.command, sst_graph.cli.commands.info, sst_graph.data.kitti.odometry, cv2, numpy
-numpy.ones((200, 200)) @ numpy.ones((200, 200))  # OpenBLAS takes its buffer now; later it would end the process
+numpy.ones((200, 200)) @ numpy.ones((200, 200))  # OpenBLAS takes its buffer, or ends the process
 sys.argv = ["sst-graph", "info", sys.argv[1]]
 with open("/proc/self/statm", encoding="ascii") as stream:
     present = int(stream.read().split()[0]) * resource.getpagesize()
