@@ -98,8 +98,9 @@ inspection_plots(inspection)["record_next.png"]
 #
 # So a stop is recorded: three frames at rest. They say nothing about the offset, but all about the pose.
 # Each drive gives a marginal: a quadratic cost on extrinsic and time offset, with the covariance of its
-# result. Their sum is the calibration by both, without reading a single frame again. The streets have the
-# same seed, so the two share a few errors of masks.
+# result. Their sum is the calibration by both, without reading a single frame again. What each errs by alone
+# becomes less; what both may err by together, such as a principal point that is off, does not. The streets
+# have the same seed, so the two share a few errors of masks.
 
 # %%
 second = sst_graph.calibrate(standing, standing.nominal)

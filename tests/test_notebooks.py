@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from matplotlib import pyplot
 
+from sst_graph.export import marginal_of_result
+from sst_graph.marginal import separated
 from sst_graph.result import CalibrationResult
 
 NOTEBOOKS = Path(__file__).resolve().parent.parent / "notebooks"
@@ -97,8 +99,13 @@ def test_a_stop_settles_the_weak_direction(monkeypatch: pytest.MonkeyPatch, tmp_
     result, second, fused = found["result"], found["second"], found["fused"].covariance()
     assert result.status == "unobservable" and result.weak_directions
     assert error_in_sigmas(result, found["truth"]) < 18.5  # 99 % of chi^2 with 7 degrees of freedom
-    assert (np.diag(fused) < np.diag(result.covariance)).all()
-    assert (np.diag(fused) < np.diag(second.covariance)).all()
+    own, *parts = (
+        separated(marginal).own.covariance()
+        for marginal in (found["fused"], marginal_of_result(result), marginal_of_result(second))
+    )
+    for part, whole in zip(parts, (result, second), strict=True):
+        assert (np.diag(own) < np.diag(part)).all()
+        assert fused[3, 3] < whole.covariance[3, 3] and fused[6, 6] < whole.covariance[6, 6]
     assert fused[6, 6] < 0.3**2 * result.covariance[6, 6]
     assert (np.diag(found["independent"]) < np.diag(result.covariance)).all()
 
