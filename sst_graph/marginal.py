@@ -281,7 +281,11 @@ class Separated:
         Raises:
             EstimationError: a direction without information.
         """
-        return self.own.covariance() + _covariance_by(self.errors)
+        return self.own.covariance() + self.common_covariance()
+
+    def common_covariance(self) -> FloatArray:
+        """(7, 7) of the optimum by the common errors alone."""
+        return _covariance_by(self.errors)
 
     def together(self) -> CalibrationMarginal:
         """As one marginal, with the same optimum and the same least cost.

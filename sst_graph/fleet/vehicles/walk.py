@@ -94,8 +94,8 @@ def smoothed(drives: Sequence[DriveEstimate], steps: Collection[int], config: Wa
     found = []
     for upto, after in zip(ways.upto, ways.after, strict=True):
         both = upto if after is None else upto.plus(after)
-        best, covariance = both.own.best(), both.own.covariance()
-        found.append(Smoothed(best.cTl, best.time_offset_s, covariance, both.covariance() - covariance))
+        cTl, time_offset_s = both.own.best()
+        found.append(Smoothed(cTl, time_offset_s, both.own.covariance(), both.common_covariance()))
     return found
 
 
