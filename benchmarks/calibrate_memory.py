@@ -22,7 +22,7 @@ def peak_mb(drive: Path, frames: int, out: Path) -> float:
     """Largest resident memory [MB] of a calibration of the first frames."""
     arguments = ["calibrate", str(drive), "--frames", f"0:{frames}", "--out", str(out)]
     process = subprocess.Popen(
-        [sys.executable, "-m", "sst_graph.cli", *arguments],
+        [sys.executable, "-m", "sst_graph", *arguments],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )

@@ -41,7 +41,7 @@ def calibrated(code: Path, arguments: list[str], out: Path) -> Run:
     Raises:
         SystemExit: it did not end with a result.
     """
-    command = [sys.executable, "-m", "sst_graph.cli", "calibrate", *arguments]
+    command = [sys.executable, "-m", "sst_graph", "calibrate", *arguments]
     environment = {**os.environ, "PYTHONPATH": str(code)}
     with (out / "printed").open("w+") as printed:
         process = subprocess.Popen(

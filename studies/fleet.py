@@ -65,7 +65,7 @@ SMALL = SimulationConfig(
     translation_error_m=0.03,
 )
 """Six small pictures at 3 Hz: stands, accelerates, turns and brakes."""
-PROGRAM = [sys.executable, "-m", "sst_graph.cli"]
+PROGRAM = [sys.executable, "-m", "sst_graph"]
 SETTINGS = ["--no-report"]
 for _setting in (
     "use_motion=never",

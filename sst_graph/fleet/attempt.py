@@ -31,7 +31,7 @@ They say nothing of the drive, so they are no part of its retries; without an en
 runs would keep a batch for ever.
 """
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-_PROGRAM_MODULE, _SAID_BY_IT = "sst_graph.cli", "sst-graph: "
+_PROGRAM_MODULE, _SAID_BY_IT = "sst_graph", "sst-graph: "
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import pytest
 from sst_graph.cli import main
 from sst_graph.fleet import Place, Record
 
-PROGRAM = [sys.executable, "-m", "sst_graph.cli"]
+PROGRAM = [sys.executable, "-m", "sst_graph"]
 FAST = ["--no-report"]
 
 

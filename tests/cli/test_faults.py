@@ -153,7 +153,7 @@ def test_a_full_stdout_does_not_change_what_a_calibration_is_worth(bench: Bench)
     for unbuffered in ("", "1"):
         desk = bench.desk()
         ended = subprocess.run(
-            [sys.executable, "-m", "sst_graph.cli", *bench.arguments(COMMANDS["calibrate"], desk)],
+            [sys.executable, "-m", "sst_graph", *bench.arguments(COMMANDS["calibrate"], desk)],
             stdout=os.open("/dev/full", os.O_WRONLY),
             stderr=subprocess.PIPE,
             text=True,
@@ -170,7 +170,7 @@ def test_a_full_stdout_does_not_change_what_a_calibration_is_worth(bench: Bench)
 
 def test_closed_streams_do_not_become_files(bench: Bench) -> None:
     desk = bench.desk()
-    command = [sys.executable, "-m", "sst_graph.cli", *bench.arguments(COMMANDS["export"], desk)]
+    command = [sys.executable, "-m", "sst_graph", *bench.arguments(COMMANDS["export"], desk)]
     shell = 'exec "$@" <&- >&- 2>&-'
     done = subprocess.run(["bash", "-c", shell, "bash", *command], timeout=60, check=False)
     assert done.returncode == 0
@@ -189,7 +189,7 @@ def test_same_input_same_bytes_with_one_thread_and_two(bench: Bench) -> None:
         environment = {**os.environ, "OMP_NUM_THREADS": threads, "PYTHONHASHSEED": seed}
 
         def run(*arguments: str, env: dict[str, str] = environment) -> bytes:
-            command = [sys.executable, "-m", "sst_graph.cli", *arguments]
+            command = [sys.executable, "-m", "sst_graph", *arguments]
             done = subprocess.run(command, capture_output=True, timeout=300, check=False, env=env)
             assert done.returncode == (0 if "export" in arguments else 3), done.stderr.decode()
             return done.stdout

@@ -79,7 +79,7 @@ def test_a_terminal_has_a_bar_and_quiet_has_none(tmp_path: Path) -> None:
         termios.tcsetwinsize(process_end, (24, 80))
         arguments = ["simulate", str(tmp_path / f"street{has_bar}"), *SMALL, *options]
         done = subprocess.run(
-            [sys.executable, "-m", "sst_graph.cli", *arguments],
+            [sys.executable, "-m", "sst_graph", *arguments],
             stdout=subprocess.PIPE,
             stderr=process_end,
             text=True,

@@ -99,7 +99,7 @@ def test_overwrite_spares_folders_of_others(tmp_path: Path, capsys: pytest.Captu
 def test_a_killed_run_leaves_nothing_under_the_name(tmp_path: Path) -> None:
     out = tmp_path / "drive"
     arguments = ["simulate", str(out), *SMALL, "--set", "frames=150"]
-    process = subprocess.Popen([sys.executable, "-m", "sst_graph.cli", *arguments], stderr=subprocess.DEVNULL)
+    process = subprocess.Popen([sys.executable, "-m", "sst_graph", *arguments], stderr=subprocess.DEVNULL)
     try:
         deadline = time.monotonic() + 60
         while not list(tmp_path.glob(".drive.sst-graph-partial/new/sequences/00/velodyne/000001.bin")):
@@ -114,7 +114,7 @@ def test_a_killed_run_leaves_nothing_under_the_name(tmp_path: Path) -> None:
 def test_an_interrupted_run_leaves_nothing_at_all(tmp_path: Path) -> None:
     arguments = ["simulate", str(tmp_path / "drive"), *SMALL, "--set", "frames=150"]
     process = subprocess.Popen(
-        [sys.executable, "-m", "sst_graph.cli", *arguments],
+        [sys.executable, "-m", "sst_graph", *arguments],
         stderr=subprocess.PIPE,
         text=True,
         # Shells start jobs in the background with this signal ignored.

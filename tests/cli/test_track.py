@@ -84,7 +84,7 @@ def test_killed_and_resumed(street: Path, tmp_path: Path, capsys: pytest.Capture
     other = ["--checkpoint", str(tmp_path / "other.npz"), "--checkpoint-every", "3"]
     main(["track", str(street), *SOON, *other, "--out", str(whole)])
     unbroken = _lines(capsys.readouterr().out)
-    command = [sys.executable, "-m", "sst_graph.cli", "track", str(street), *SOON]
+    command = [sys.executable, "-m", "sst_graph", "track", str(street), *SOON]
     command += ["--checkpoint", str(checkpoint), "--checkpoint-every", "3"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, bufsize=0, env={**os.environ})
     assert process.stdout is not None

@@ -17,7 +17,7 @@ COMMANDS = ("demo", "simulate", "calibrate", "evaluate", "overlay")
 
 
 def _run(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "sst_graph.cli", *arguments]
+    command = [sys.executable, "-m", "sst_graph", *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
 
@@ -91,7 +91,7 @@ def test_bad_input_from_the_shell(tmp_path: Path) -> None:
 
 
 def test_a_closed_pipe_is_no_crash(tmp_path: Path) -> None:
-    command = f"{sys.executable} -m sst_graph.cli calibrate --help | true"
+    command = f"{sys.executable} -m sst_graph calibrate --help | true"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=60, check=False)
     assert done.stderr == ""
 

@@ -132,7 +132,7 @@ def test_without_the_extra_the_message_names_it(street: Path, result: Path, tmp_
         [
             sys.executable,
             "-m",
-            "sst_graph.cli",
+            "sst_graph",
             "overlay",
             result,
             street,

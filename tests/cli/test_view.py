@@ -70,7 +70,7 @@ def test_without_the_extra_the_message_names_it(street: Path, result: Path, tmp_
     path = os.pathsep.join([str(tmp_path), *sys.path])
     for command in (["view", result, street], ["track", street, "--view"]):
         done = subprocess.run(
-            [sys.executable, "-m", "sst_graph.cli", *command],
+            [sys.executable, "-m", "sst_graph", *command],
             env={**os.environ, "PYTHONPATH": path},
             capture_output=True,
             text=True,

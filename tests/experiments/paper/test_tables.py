@@ -18,7 +18,7 @@ from sst_graph.cli import main
 from sst_graph.cli.commands.experiment import code_version
 from sst_graph.experiments.paper.tables import STATE
 
-PROGRAM = [sys.executable, "-m", "sst_graph.cli", "experiment"]
+PROGRAM = [sys.executable, "-m", "sst_graph", "experiment"]
 DRIVES = Path(__file__).resolve().parents[4] / "shared" / "data"
 
 
