@@ -10,32 +10,44 @@ from numpy.typing import NDArray
 FARTHEST_S = 1.0
 """Points are measured within this of the scan's stamp."""
 
+_SCAN_LASTS_S = (0.005, 0.5)
+"""From a narrow part of a fast sweep to a slow one. The ends lie less than 1000 apart: at most one unit fits."""
+_OF_FLOATS_NS = (1_000_000_000, 1_000_000, 1_000, 1)
+_OF_WHOLE_NS = (1, 1_000, 1_000_000)
+"""Units in which times are counted, the usual one first."""
+
 
 def seconds_after_stamp(values: NDArray[Any], stamp_ns: int) -> NDArray[np.float64] | None:
     """Times (n,) of points after their scan's stamp [s]; None where all are 0, as drivers leave the field.
 
-    Whole numbers are nanoseconds, floats seconds, both after the stamp or on the stamp's clock; floats are
-    nanoseconds on that clock, too (Livox). The first of these readings by which all points lie within
-    FARTHEST_S of the stamp is taken, else that by which they lie nearest: the caller checks the distance,
-    and for NaN.
+    Drivers count seconds in floats and nanoseconds in whole numbers, and some milliseconds or microseconds,
+    after the stamp or on the stamp's clock. The unit is that by which the scan lasts 5 ms to 0.5 s within
+    FARTHEST_S of its stamp. Where none fits, it is the usual one, or absolute nanoseconds in floats (Livox),
+    whichever leaves the points nearest to the stamp: the caller checks the distance, and for NaN.
     """
     if not values.any():
         return None
-    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
-    readings: list[NDArray[np.float64]]
-    if values.dtype.kind in "iu":
-        whole = values.astype(np.int64)
-        readings = [whole.astype(np.float64) * 1e-9, (whole - stamp_ns).astype(np.float64) * 1e-9]
-    else:
-        times = values.astype(np.float64)
-        readings = [
-            times,
-            (times - float(seconds)) - nanoseconds * 1e-9,
-            (times - float(stamp_ns)) * 1e-9,
-        ]
-    return min(readings, key=lambda reading: max(_farthest(reading), FARTHEST_S))
+    whole = values.dtype.kind in "iu"
+    numbers = values.astype(np.int64 if whole else np.float64)
+    finite = numbers[np.isfinite(numbers)]
+    ends = np.array([finite.min(), finite.max()]) if len(finite) else numbers[:1]
+    usual, *others = _OF_WHOLE_NS if whole else _OF_FLOATS_NS
+    for unit_ns in (usual, *others):
+        for clock_ns in (0, stamp_ns):
+            first, last = _read(ends[0], unit_ns, clock_ns), _read(ends[-1], unit_ns, clock_ns)
+            if _SCAN_LASTS_S[0] <= last - first <= _SCAN_LASTS_S[1] and _farthest(first, last) <= FARTHEST_S:
+                return _read(numbers, unit_ns, clock_ns)
+    readings = [(usual, 0), (usual, stamp_ns), (1, stamp_ns)]
+    nearest = min(readings, key=lambda r: max(_farthest(*(_read(end, *r) for end in ends)), FARTHEST_S))
+    return _read(numbers, *nearest)
 
 
-def _farthest(seconds: NDArray[np.float64]) -> float:
-    """Largest distance from the stamp [s]; NaN and inf aside."""
-    return float(np.abs(seconds).max(initial=0.0, where=np.isfinite(seconds)))
+def _read(numbers: Any, unit_ns: int, clock_ns: int) -> Any:
+    """Seconds after an instant on the clock that counts in a unit; whole numbers are subtracted exactly."""
+    count, rest_ns = divmod(clock_ns, unit_ns)
+    return (numbers - numbers.dtype.type(count)) * (unit_ns * 1e-9) - rest_ns * 1e-9
+
+
+def _farthest(*seconds: float) -> float:
+    """Largest distance from the stamp [s]; NaN aside."""
+    return float(np.nanmax(np.abs(seconds), initial=0.0))

@@ -100,7 +100,7 @@ def test_a_cloud_without_points(tmp_path: Path) -> None:
         assert read_cloud(path).points().shape == (0, 3)
 
 
-def test_times_are_seconds_or_nanoseconds_absolute_or_relative(tmp_path: Path) -> None:
+def test_times_count_in_any_unit_absolute_or_relative(tmp_path: Path) -> None:
     stamp_ns, offsets = 1_317_042_145_000_000_000, np.array([-0.05, 0.0, 0.05])
     xyz, used = {name: np.zeros(3) for name in "xyz"}, np.ones(3, bool)
     for name, values, precision in (
@@ -109,6 +109,8 @@ def test_times_are_seconds_or_nanoseconds_absolute_or_relative(tmp_path: Path) -
         ("timestamp", stamp_ns * 1e-9 + offsets, 1e-6),
         ("timestamp", stamp_ns + offsets * 1e9, 1e-6),
         ("time", offsets, 1e-9),
+        ("t", np.rint(offsets * 1e6).astype(np.int32), 1e-9),
+        ("timestamp", stamp_ns // 1000 + np.rint(offsets * 1e6).astype(np.int64), 1e-9),
     ):
         np.savez(tmp_path / "a.npz", **xyz, **{name: values})
         found = read_cloud(tmp_path / "a.npz").offsets_s(stamp_ns, used)

@@ -91,7 +91,7 @@ class Cloud:
         if len(bad):
             times = count_of(len(bad), "time that is", "times that are")
             found = f"{times} NaN or beyond {FARTHEST_S:g} s, first at index {bad[0]}"
-            expected = "seconds in floats or nanoseconds in whole numbers, absolute or after the scan's stamp"
+            expected = "times within a second of the scan's stamp, absolute or after it"
             raise DataError(self.path, found, expected)
         offsets_s = np.zeros(len(used), np.float32)
         offsets_s[kept] = seconds

@@ -129,6 +129,11 @@ SECONDS = np.array([0.0, 0.01, 0.025, 0.05, 0.0999])
         ("timestamp", 1_700_000_000.0 + (0.123456789 + SECONDS).astype("<f8")),  # Hesai, RoboSense
         ("timestamp", (SECONDS * 1e9 + float(STAMP_NS)).astype("<f8")),  # Livox, driver 2
         ("t", (SECONDS * 1e9).round().astype("<i8").astype("<u4")),
+        ("time", (SECONDS * 1e6).astype("<f4")),  # drivers that count microseconds, milliseconds
+        ("time", (SECONDS * 1e3).astype("<f4")),
+        ("time", (SECONDS * 1e9).astype("<f8")),
+        ("t", (SECONDS * 1e6).round().astype("<u4")),
+        ("timestamp", (SECONDS * 1e6) + STAMP_NS * 1e-3),
     ],
 )
 def test_times_of_points(name: str, values: np.ndarray[Any, Any]) -> None:
@@ -142,6 +147,16 @@ def test_times_before_the_stamp() -> None:
     cloud = read(table(time=-SECONDS.astype("<f4")))
     assert cloud.offsets_s is not None
     np.testing.assert_allclose(cloud.offsets_s, -SECONDS, atol=1e-8)
+
+
+@pytest.mark.parametrize("values", [SECONDS / 1000.0, (SECONDS * 1e6).round().astype("<u4")])
+def test_times_too_close_for_a_scan_in_any_unit_have_the_usual_one(values: np.ndarray[Any, Any]) -> None:
+    """A part of the sweep that lasts 10 us."""
+    few = values[:2] if values.dtype.kind == "f" else values[:2] // 10
+    cloud = read(table(2, time=few))
+    expected = few if few.dtype.kind == "f" else few * 1e-9
+    assert cloud.offsets_s is not None
+    np.testing.assert_allclose(cloud.offsets_s, expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["<f4", "<f8", "<u4"])
