@@ -11,7 +11,7 @@ FARTHEST_S = 1.0
 """Points are measured within this of the scan's stamp."""
 
 _SCAN_LASTS_S = (0.005, 0.5)
-"""From a narrow part of a fast sweep to a slow one. The ends lie less than 1000 apart: at most one unit fits."""
+"""From a narrow part of a fast sweep to a slow one: less than 1000 times longer, so at most one unit fits."""
 _OF_FLOATS_NS = (1_000_000_000, 1_000_000, 1_000, 1)
 _OF_WHOLE_NS = (1, 1_000, 1_000_000)
 """Units in which times are counted, the usual one first."""
