@@ -36,10 +36,10 @@ def seconds_after_stamp(values: NDArray[Any], stamp_ns: int) -> NDArray[np.float
         for clock_ns in (0, stamp_ns):
             first, last = _read(ends[0], unit_ns, clock_ns), _read(ends[-1], unit_ns, clock_ns)
             if _SCAN_LASTS_S[0] <= last - first <= _SCAN_LASTS_S[1] and _farthest(first, last) <= FARTHEST_S:
-                return _read(numbers, unit_ns, clock_ns)
+                return np.asarray(_read(numbers, unit_ns, clock_ns))
     readings = [(usual, 0), (usual, stamp_ns), (1, stamp_ns)]
     nearest = min(readings, key=lambda r: max(_farthest(*(_read(end, *r) for end in ends)), FARTHEST_S))
-    return _read(numbers, *nearest)
+    return np.asarray(_read(numbers, *nearest))
 
 
 def _read(numbers: Any, unit_ns: int, clock_ns: int) -> Any:
