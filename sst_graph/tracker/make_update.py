@@ -27,7 +27,7 @@ def make_update(
     """
     estimate, changes = tracker.estimate, tracker.monitor.changes
     point, covariance = estimate.point, estimate.reported_covariance()
-    confirmation, contradictions = changes.confirmation, contradiction_sentence(estimate.tests.findings)
+    confirmation, contradictions = changes.confirmation, contradiction_sentence(estimate.findings)
     status: TrackStatus = "alarm" if tracker.initializer.alarmed else "starting"
     weak: tuple[WeakDirection, ...] = ()
     sweep = ""

@@ -67,7 +67,7 @@ def tracker_result(tracker: Tracker, drive: str, camera_name: str) -> Calibratio
                 c.name.lower(): bias
                 for (_, c), bias in estimate.point.state(config.calibration.classes).biases_px.items()
             },
-            "assumptions": assumption_report(estimate.considered(), estimate.tests.findings),
+            "assumptions": assumption_report(estimate.considered(), estimate.findings),
             "estimated": last.to_dict()["estimated"],
             "error_model": None
             if model is None

@@ -43,8 +43,9 @@ class Monitor:
             Statistic of the change test, and from where to begin again if the calibration has changed.
         """
         counts = {scan: len(matches.found[scan].pair) for scan in matches.new}
-        chi2 = self.changes.check(sorted(matches.waiting), counts, estimate.for_comparison())
-        change = self.changes.change(estimate.for_comparison(), chi2)
+        compared = estimate.for_comparison()
+        chi2 = self.changes.check(sorted(matches.waiting), counts, compared)
+        change = self.changes.change(compared, chi2)
         if change is not None:
             if self.changes.start_is_over(matches.scan):
                 return chi2, change
@@ -57,16 +58,10 @@ class Monitor:
             self.adoption.add_held_out(cost, estimate.point, estimate.guessed_point)
         return chi2, None
 
-    def recheck_start(self, scan: int, estimate: OnlineEstimate) -> None:
-        """At times: check the start against the frames since."""
-        assert estimate.smoother is not None
-        self.changes.recheck_start(scan, list(estimate.smoother.entries), estimate.for_comparison())
-
     def check_start_at_end(self, estimate: OnlineEstimate) -> None:
         """At the end of a drive: check a start without later frames against its own frames; an estimate by
         edges, which few frames hardly confirm, against all frames of the window."""
-        assert estimate.smoother is not None
-        scans, compared = list(estimate.smoother.entries), estimate.for_comparison()
-        self.changes.check_start_at_end(scans, compared)
+        compared = estimate.for_comparison()
+        self.changes.check_start_at_end(compared)
         if estimate.edges is not None and not estimate.reasons:
-            self.changes.confirm_at_end(scans, compared)
+            self.changes.confirm_at_end(compared)

@@ -12,6 +12,7 @@ from sst_graph.tracker.by_edges.kinds import by_edges, by_labels, of_kind
 from sst_graph.tracker.by_edges.review import variance_ratio
 from sst_graph.tracker.by_edges.start import first_edge_estimate_steps
 from sst_graph.tracker.config import TrackerConfig
+from sst_graph.tracker.monitor.statistic import ComparedEstimate
 from sst_graph.tracker.spread_work import NUMERICAL_ERRORS, SpreadWork
 from sst_graph.tracker.start.first_estimate import FirstEstimate, StartGuess, Stretch
 from sst_graph.tracker.start.solution import first_estimate_steps, prior_gaussian
@@ -76,10 +77,10 @@ class Initialization:
     scans: int
     first: FirstEstimate
 
-    @property
-    def variance_ratio(self) -> float:
-        """Of its matches (:func:`~sst_graph.tracker.by_edges.review.variance_ratio`)."""
-        return variance_ratio(self.first.review, self.uncertainty.covariance)
+    def for_comparison(self) -> ComparedEstimate:
+        """For the comparison of frames with it."""
+        ratio = variance_ratio(self.first.review, self.uncertainty.covariance)
+        return self.uncertainty.compared(self.smoother, ratio)
 
 
 def start_steps(stretch: Stretch, guess: StartGuess, config: TrackerConfig) -> Stepwise[FirstEstimate]:

@@ -106,7 +106,7 @@ def relinearize_window(
     smoother.update(found, missing, 0, alive)
     smoother.optimize(_INNER)
     if not converged:
-        smoother.set_point(at)
+        smoother.point = at
     return converged
 
 
