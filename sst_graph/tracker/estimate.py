@@ -19,8 +19,7 @@ from sst_graph.errors import EstimationError
 from sst_graph.odometry.sweep import SweepDecision
 from sst_graph.tracker.assumption_tests import EVERY, score_findings
 from sst_graph.tracker.by_edges.kinds import by_edges
-from sst_graph.tracker.by_edges.review import variance_ratio
-from sst_graph.tracker.by_edges.reviews import EdgeReviews
+from sst_graph.tracker.by_edges.review import EdgeReviews, variance_ratio
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.history import MAX_EPOCHS, HistoryEntry, smoothed_epochs
 from sst_graph.tracker.monitor.statistic import ComparedEstimate
@@ -106,7 +105,7 @@ class OnlineEstimate:
         smoother, window = initialization.smoother, self.matcher.window
         self.smoother, self.uncertainty = smoother, initialization.uncertainty
         if self.edges is not None:
-            self.edges.begin(window.next_scan, initialization.first)
+            self.edges.begin(window.next_scan, initialization.first.review, initialization.first.known)
         self.findings = score_findings(smoother, self.config.calibration.assumptions)
         self.starts += 1
         soon = len(window.scans) + initialization.scans

@@ -20,7 +20,6 @@ from sst_graph.timestamps import LATEST_NS
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.estimate import FrameMatches, OnlineEstimate
 from sst_graph.tracker.inputs import SensorInputs
-from sst_graph.tracker.make_update import current_update, make_update
 from sst_graph.tracker.marginal import TrackedMarginal, increment, tracked_marginal
 from sst_graph.tracker.monitor.monitor import Monitor
 from sst_graph.tracker.result import tracker_result
@@ -35,7 +34,7 @@ from sst_graph.tracker.start.initializer import (
 from sst_graph.tracker.storage.checkpoint import Saver, load_checkpoint
 from sst_graph.tracker.storage.resume import Setup
 from sst_graph.tracker.storage.snapshot import Snapshot
-from sst_graph.tracker.track_update import Sensor, TrackUpdate
+from sst_graph.tracker.track_update import Sensor, TrackUpdate, current_update, make_update
 from sst_graph.tracker.window.matcher import WindowMatcher
 from sst_graph.types import CameraImage, Frame, Scan
 from sst_graph.validation import checked_frame, checked_guess, checked_intrinsics

@@ -28,8 +28,8 @@ from sst_graph.graph.matching import Tracks
 from sst_graph.graph.outer_loop import JointProblem, solve_joint
 from sst_graph.graph.state import State, nuisance_key
 from sst_graph.objects.tracks import object_tracks
-from sst_graph.tracker.make_update import current_update
 from sst_graph.tracker.sums.running_sums import RunningSums
+from sst_graph.tracker.track_update import current_update
 from sst_graph.tracker.window.gaussian import Gaussian, Point
 from sst_graph.tracker.window.window import Window
 

@@ -40,8 +40,8 @@ from sst_graph.files.object_store import (
 )
 from sst_graph.files.reading import FileKind, parse_json, path_of, read_file
 from sst_graph.odometry.sweep import SweepDecision
-from sst_graph.tracker.make_update import current_update
 from sst_graph.tracker.storage.resume import Setup, check_inputs, check_setup
+from sst_graph.tracker.track_update import current_update
 from sst_graph.types import NO_PICTURE, CameraImage
 
 if TYPE_CHECKING:
