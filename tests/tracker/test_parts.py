@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from sst_graph.covariance.error_model import ErrorModel, SideResiduals, fit_error_model
 from sst_graph.covariance.sums import ScoreSums
 from sst_graph.tracker.config import AlarmConfig, TrackerConfig
-from sst_graph.tracker.monitor.adoption import Adoption
 from sst_graph.tracker.monitor.confirmation import Confirmation, steps
+from sst_graph.tracker.monitor.monitor import Adoption
 from sst_graph.tracker.monitor.statistic import ChangeStatistic, ComparedEstimate, EstimateCovariance
 from sst_graph.tracker.sums.linearized_pair import LinearizedPair
 from sst_graph.tracker.sums.running_sums import RunningSums

@@ -16,8 +16,7 @@ from sst_graph.batch.by_edges.optimum import CONVERGED_STEP
 from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX
 from sst_graph.batch.lower_edges import LowerEdgeSupport
 from sst_graph.factors.robust import RobustKernel
-from sst_graph.graph.convergence import step_share
-from sst_graph.graph.outer_loop import NARROW_KERNELS_PX
+from sst_graph.graph.outer_loop import NARROW_KERNELS_PX, step_share
 from sst_graph.tracker.by_edges.kinds import by_edges
 from sst_graph.tracker.window.gaussian import Point, inverted
 from sst_graph.tracker.window.matcher import WindowMatcher
@@ -76,7 +75,7 @@ def relinearize_window(
 
     Matches made frame by frame keep the estimate within one or two standard deviations of the batch's. Where
     some matches appear and disappear in turn, the estimate oscillates, and the steps are shortened as in the
-    batch (:mod:`sst_graph.graph.convergence`). The steps are Gauss-Newton's; the graph takes the last matches
+    batch (:mod:`sst_graph.graph.outer_loop`). The steps are Gauss-Newton's; the graph takes the last matches
     only.
 
     Args:
