@@ -139,11 +139,12 @@ def linearize_pair(
     J = J - JV @ gain  # sensitivity of the estimate to a residual, the twist at its optimum
     track = np.concatenate([columns.tracks_of(pair, c) for c in pair.matches])
     side = track * SIDES + np.concatenate([m.sides for m in pair.matches.values()])
-    own = roots / np.sqrt(share)
+    own, scores = roots / np.sqrt(share), ScoreSums.of_frame(J, roots, side)
     return LinearizedPair(
         information,
         observed,
-        _with_share(ScoreSums.of_frame(J, roots, side), share),
+        # The errors are those of the matches' original weights.
+        replace(scores, independent=share * scores.independent),
         SideResiduals.of(unweighted(r, roots), own**2, side),
         len(pair),
         places,
@@ -152,12 +153,6 @@ def linearize_pair(
         curvature,
         _by_static_objects(pair, point, A[:, known], motion[np.ix_(known, known)]),
     )
-
-
-def _with_share(scores: ScoreSums, share: float) -> ScoreSums:
-    """Scores of matches whose weights are multiplied by a common factor; the errors are those of the original
-    weights."""
-    return replace(scores, independent=share * scores.independent)
 
 
 def _by_static_objects(pair: PairMatches, point: Point, A: FloatArray, motion: FloatArray) -> Gaussian | None:
