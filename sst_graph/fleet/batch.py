@@ -17,16 +17,16 @@ from pathlib import Path
 from sst_graph.config import Settings, setting
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.files.json_table import json_table
-from sst_graph.files.reading import FileKind, digest_of_file, parse_json
+from sst_graph.files.reading import FileKind, digest_of_file
 from sst_graph.files.staging import lock_file
 from sst_graph.files.strict_json import strict_json
 from sst_graph.fleet.attempt import DRIVES, RECORDS, Job, finished_record, run_drive
-from sst_graph.fleet.dask_pool import Cluster, run_on_dask
+from sst_graph.fleet.dask_pool import run_on_dask
 from sst_graph.fleet.drives import Drive, vehicle_files
 from sst_graph.fleet.isolated import Limits
 from sst_graph.fleet.local_pool import run_locally
 from sst_graph.fleet.places import Place, read_many
-from sst_graph.fleet.record import Record
+from sst_graph.fleet.record import Record, json_of
 from sst_graph.fleet.scratch import sweep_scratch
 from sst_graph.fleet.summary.page import summary_html
 from sst_graph.fleet.summary.tables import Row, csv_bytes, drive_rows, parquet_bytes, vehicle_rows
@@ -130,9 +130,7 @@ def open_batch(out: Place, options: Sequence[str]) -> Iterator[None]:
         raise ConfigError(f"{out}: found a file, expected a folder or nothing")
     if (out / BATCH).exists():
         place = (out / BATCH).url
-        table = json_table(
-            parse_json(_utf8((out / BATCH).read(), place), place, BATCH), place, FORMAT, VERSION
-        )
+        table = json_table(json_of((out / BATCH).read(), place, BATCH), place, FORMAT, VERSION)
         before = [str(one) for one in table.sequence("options")]
         _check_files(out, table.mapping("files"), options)
         if before != list(options):
@@ -202,7 +200,7 @@ def run_batch(
     failed = 0
     told(Progress(earlier, len(jobs), earlier, failed, 0.0))
     if config.dask and left:
-        coming = run_on_dask(left, Cluster(config.dask, config.workers), run)
+        coming = run_on_dask(left, config.dask, config.workers, run)
     else:
         coming = run_locally(left, config.workers, run)
     for record in coming:
@@ -297,10 +295,3 @@ def _locked(out: Place) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
-
-
-def _utf8(data: bytes, place: str) -> str:
-    try:
-        return data.decode("utf-8")
-    except UnicodeDecodeError:
-        raise DataError(place, "bytes that are no UTF-8", BATCH) from None
