@@ -34,8 +34,8 @@ from sst_graph.tracker.window.relinearization import (
     RelinearizationSchedule,
     WindowRelinearization,
     relinearize_window,
+    scans_to_match,
 )
-from sst_graph.tracker.window.rematching import scans_to_match
 from sst_graph.tracker.window.smoother import WindowSmoother
 
 _LOG = logging.getLogger(__name__)

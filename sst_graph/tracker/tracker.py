@@ -14,13 +14,14 @@ from sst_graph.drive.stamp_intervals import Jump
 from sst_graph.errors import DataError, EstimationError
 from sst_graph.factors.arguments import checked_count, checked_type
 from sst_graph.factors.camera import PinholeCamera
+from sst_graph.marginal import inverse
 from sst_graph.odometry.sweep import SweepDecision
 from sst_graph.result import UNNAMED_CAMERA, CalibrationResult
 from sst_graph.timestamps import LATEST_NS
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.estimate import FrameMatches, OnlineEstimate
 from sst_graph.tracker.inputs import SensorInputs
-from sst_graph.tracker.marginal import TrackedMarginal, increment, tracked_marginal
+from sst_graph.tracker.marginal import TrackedMarginal, increment
 from sst_graph.tracker.monitor.monitor import Monitor
 from sst_graph.tracker.result import tracker_result
 from sst_graph.tracker.spread_work import NUMERICAL_ERRORS
@@ -196,7 +197,8 @@ class Tracker:
         if not self.estimate.exists:
             raise EstimationError("the tracker has no estimate yet: no marginal")
         point, starts = self.estimate.point, self.estimate.starts
-        whole = tracked_marginal(point.cTl, point.time_offset_s, self.estimate.reported_covariance(), starts)
+        information = inverse(self.estimate.reported_covariance(), "covariance of the tracker")
+        whole = TrackedMarginal(point.cTl, point.time_offset_s, information, np.zeros(7), start=starts)
         if since is None:
             return whole
         if since.start != whole.start:

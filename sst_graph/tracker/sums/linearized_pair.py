@@ -85,11 +85,6 @@ class PairColumns:
     held: Sequence[str] = ()
     config: MatchConfig = field(default_factory=MatchConfig)
 
-    @property
-    def held_assumptions(self) -> list[str]:
-        """Those whose parameters are held."""
-        return [name for name in self.held if name not in EDGE_ERRORS]
-
     def object_places(self, pair: PairMatches) -> dict[int, int]:
         """Place of its class's bias for each object of a pair, if objects have a bias of their own."""
         return {
@@ -189,7 +184,8 @@ def _rows(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Weighted rows of all matches by unknowns and held parameters (m, n) and twist (m, 6), residuals and
     root weights (m,)."""
-    classes, held, assumptions = names.classes, names.held, names.held_assumptions
+    classes, held = names.classes, names.held
+    assumptions = [name for name in held if name not in EDGE_ERRORS]
     blocks, twists, residuals, roots = [], [], [], []
     for c, matches in pair.matches.items():
         alignment, place = matches.alignment, classes.index(c)
