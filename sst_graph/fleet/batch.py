@@ -43,8 +43,6 @@ VEHICLES = "vehicles"
 _NAME_FILES = ("--config", "--init", "--image-model", "--lidar-model")
 _OPTION_FILE = FileKind("a file that an option names", 2**36)
 
-Told = Callable[["Progress"], None]
-
 
 @dataclass(frozen=True)
 class BatchConfig(Settings):
@@ -180,13 +178,13 @@ def run_batch(
     drives: Sequence[Drive],
     out: Place,
     config: BatchConfig,
-    told: Told,
+    progress: Callable[[Progress], None],
     run: Callable[[Job], Record] = run_drive,
 ) -> dict[str, Record]:
     """Run all drives that have no result yet; the records of all, by name.
 
     Args:
-        told: is called after every drive, and now and then between.
+        progress: is called after every drive, and now and then between.
         run: what is done for a drive; it does not raise, and Dask can send it to its workers.
 
     Raises:
@@ -198,7 +196,7 @@ def run_batch(
     left = [job for job in jobs if job.drive.name not in records]
     earlier, started = len(records), time.monotonic()
     failed = 0
-    told(Progress(earlier, len(jobs), earlier, failed, 0.0))
+    progress(Progress(earlier, len(jobs), earlier, failed, 0.0))
     if config.dask and left:
         coming = run_on_dask(left, config.dask, config.workers, run)
     else:
@@ -207,7 +205,7 @@ def run_batch(
         if record is not None:
             records[record.drive] = record
             failed += not record.has_result
-        told(Progress(len(records), len(jobs), earlier, failed, time.monotonic() - started, record))
+        progress(Progress(len(records), len(jobs), earlier, failed, time.monotonic() - started, record))
     return records
 
 
