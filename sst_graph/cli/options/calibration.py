@@ -6,8 +6,7 @@ import argparse
 from pathlib import Path
 
 from sst_graph.cli.options.base_parser import SIGN, Commands, Parser, Renamed
-from sst_graph.cli.options.data import add_source_options
-from sst_graph.cli.options.labels import add_label_options
+from sst_graph.cli.options.data import add_label_options, add_source_options
 from sst_graph.cli.options.method import add_estimate, add_method, add_settings
 
 
