@@ -24,12 +24,22 @@ from sst_graph.tracker.window.window import Window
 from sst_graph.types import CameraImage, Scan
 from sst_graph.validation import checked_image, checked_scan
 
+_Data = TypeVar("_Data", Scan, CameraImage)
+
 _CLOSEST_NS = 1_000_000
 """Scans that are nearer to each other are one; no LiDAR turns a thousand times a second [ns]."""
 _FARTHEST_NS = 86_400 * 10**9
 """A stamp that is farther ahead of the one before is an error, not a pause: a day [ns]."""
 _ELSEWHERE = 5
 """Stamps in a row, rising but far from those before, that show that the clock was set."""
+_MAX_IMAGES = 600
+"""Most images that are kept, for any number of them may come while no scan does: a minute at 10 Hz."""
+_MAX_EDGE_IMAGES = 100
+"""The same where edges are aligned: the gradients of a picture take 8.5 bytes a pixel."""
+_MAX_FAILURES = 10
+"""Failures in a row after which the window is given up: it is then their likely cause."""
+_SEARCH_MARGIN_S = 1.0
+"""Images farther from a scan are kept, too, until the time offset is known [s]."""
 
 
 class StampOrder:
@@ -81,18 +91,6 @@ class StampOrder:
     def _follows(self, stamp_ns: int, before_ns: int) -> bool:
         step = stamp_ns - before_ns
         return step <= _FARTHEST_NS and (self.may_be_late or step >= _CLOSEST_NS)
-
-
-_Data = TypeVar("_Data", Scan, CameraImage)
-
-_MAX_IMAGES = 600
-"""Most images that are kept, for any number of them may come while no scan does: a minute at 10 Hz."""
-_MAX_EDGE_IMAGES = 100
-"""The same where edges are aligned: the gradients of a picture take 8.5 bytes a pixel."""
-_MAX_FAILURES = 10
-"""Failures in a row after which the window is given up: it is then their likely cause."""
-_SEARCH_MARGIN_S = 1.0
-"""Images farther from a scan are kept, too, until the time offset is known [s]."""
 
 
 def _with_own_arrays(data: _Data) -> _Data:

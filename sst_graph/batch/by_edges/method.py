@@ -30,6 +30,8 @@ from sst_graph.quality.profiles import score_profiles
 from sst_graph.stepwise import run_to_end
 from sst_graph.types import Guess
 
+FloatArray = NDArray[np.float64]
+
 
 def edges_method(
     drives: Sequence[Drive],
@@ -119,9 +121,6 @@ def _diagnostics(
             "sigmas": sigmas.tolist(),
         }
     return facts
-
-
-FloatArray = NDArray[np.float64]
 
 
 def fit_of_edges(
