@@ -31,14 +31,11 @@ class Adoption:
     Attributes:
         adopted: the calibration in use; None before the first.
         costs: of the latest held-out frames, under the candidate and under the one in use.
-        margin: fraction by which the candidate's cost may exceed that of the one in use.
     """
 
-    def __init__(self, frames: int = _FRAMES, margin: float = _MARGIN) -> None:
-        """frames: held-out frames that are compared."""
-        self.margin = margin
+    def __init__(self) -> None:
         self.adopted: Point | None = None
-        self.costs: deque[tuple[float, float]] = deque(maxlen=frames)
+        self.costs: deque[tuple[float, float]] = deque(maxlen=_FRAMES)
 
     def restart(self) -> None:
         """Forget the comparison; the calibration in use stays until another one is adopted."""
@@ -67,10 +64,10 @@ class Adoption:
 
     def propose(self, candidate: Point, trusted: bool) -> bool:
         """Adopt the candidate if it is trusted and explains held-out frames no worse; whether it was."""
-        if not trusted or len(self.costs) < (self.costs.maxlen or 0):
+        if not trusted or len(self.costs) < _FRAMES:
             return False
         ours, theirs = np.mean(self.costs, axis=0)
-        if ours > (1.0 + self.margin) * theirs:
+        if ours > (1.0 + _MARGIN) * theirs:
             return False
         self.adopted = candidate
         return True
