@@ -213,7 +213,8 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
     start_solution, agreement = solutions[0], label_agreement(problem, solutions[0])
     # 3. Lower edges of the objects, where both sensors' labels agree about them.
     lower = problem.with_lower_edges(solutions)
-    problem, solutions = problem.with_noise(lower.joint.graph), lower.solutions
+    config = replace(problem.config, noise=lower.joint.graph)
+    problem, solutions = replace(problem, config=config), lower.solutions
     # 4. Consistency: drives against each other, stretches of a drive against its rest.
     contradictions = find_contradictions(PartSolver(problem, solutions[0].state))
     # 5. Cluster-robust covariance; motion as a factor where the labels determine all unknowns.

@@ -57,7 +57,7 @@ def find_contradictions(parts: PartSolver) -> Contradictions:
         return Contradictions()
     # 1. Every stretch of every drive by itself.
     stretches = [
-        _solved(parts, [Part(number, scans) for scans in _cut(len(drive.scans))])
+        [own for scans in _cut(len(drive.scans)) if (own := parts.solve(Part(number, scans))) is not None]
         for number, drive in enumerate(parts.drives)
     ]
     # 2. Within each drive.
@@ -84,10 +84,6 @@ def _cut(scans: int) -> list[tuple[int, ...]]:
     """Positions of the scans of each stretch, evenly many."""
     count = max(1, min(_MOST_STRETCHES, scans // _LEAST_SCANS))
     return [tuple(stretch.tolist()) for stretch in np.array_split(np.arange(scans), count)]
-
-
-def _solved(parts: PartSolver, wanted: Sequence[Part]) -> list[SolvedPart]:
-    return [solved for part in wanted if (solved := parts.solve(part)) is not None]
 
 
 @dataclass(frozen=True)

@@ -112,6 +112,7 @@ def result_of(
     wrong = (*estimate.reasons, *(_jumps(drives) if config.check_stamps else ()))
     status: Status = "not_converged" if wrong else "unobservable" if weak else "ok"
     sentences = (direction.reason for direction in weak)
+    qualities = quality_of(estimate.fit) | quality_of(estimate.edges_fit, EDGES_QUALITY)
     return CalibrationResult(
         T_camera_lidar=estimate.cTl,
         time_offset_s=estimate.time_offset_s,
@@ -126,15 +127,11 @@ def result_of(
         config=to_dict(config),
         initial=guess.cTl,
         initial_time_offset_s=guess.time_offset_s,
-        diagnostics={**estimate.diagnostics, **_qualities(estimate), **sweeps_of(drives)},
+        diagnostics={**estimate.diagnostics, **qualities, **sweeps_of(drives)},
         versions=package_versions(),
         fit=estimate.fit,
         edges_fit=estimate.edges_fit,
     )
-
-
-def _qualities(estimate: MethodEstimate) -> dict[str, Any]:
-    return {**quality_of(estimate.fit), **quality_of(estimate.edges_fit, EDGES_QUALITY)}
 
 
 def quality_of(fit: Fit | None, name: str = QUALITY) -> dict[str, Any]:

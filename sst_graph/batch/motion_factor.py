@@ -109,7 +109,9 @@ def fuse_motion(
         return WithMotion(labels, _contradiction(step, chi2, motion), facts)
     if motion.misfit is not None:
         return _left_out(labels, f"the motion was left out: {motion.misfit}", facts)
-    worst = _worst_stretch(stretches, PartEstimate(step, motion.covariance))
+    own = PartEstimate(step, motion.covariance)
+    compared = [(stretch, Difference.of(stretch.step, own)) for stretch in stretches]
+    worst = min(compared, key=lambda pair: pair[1].rank, default=None)
     if worst is not None:
         facts["stretch_p_value"] = worst[1].p_value * len(stretches)
         if facts["stretch_p_value"] < FALSE_ALARM:
@@ -140,14 +142,6 @@ def gaussian_factor(state: State, covariance: FloatArray) -> gtsam.LinearContain
 def _left_out(labels: JointEstimate, sentence: str, facts: Mapping[str, Any]) -> WithMotion:
     """The estimate as it was, and why."""
     return WithMotion(labels, diagnostics={"left_out": sentence, **facts}, remarks=(sentence,))
-
-
-def _worst_stretch(
-    stretches: Sequence[SolvedPart], motion: PartEstimate
-) -> tuple[SolvedPart, Difference] | None:
-    """The stretch whose labels contradict the motion most; None without stretches."""
-    compared = [(stretch, Difference.of(stretch.step, motion)) for stretch in stretches]
-    return min(compared, key=lambda pair: pair[1].rank, default=None)
 
 
 def _of_stretch(drives: Sequence[Drive], worst: tuple[SolvedPart, Difference], state: State) -> str:

@@ -17,7 +17,7 @@ from sst_graph.covariance.considered import AssumptionConfig, Considered, consid
 from sst_graph.covariance.static_objects import static_covariance
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.fit import Fit, OuterIteration, Profile
-from sst_graph.graph.matching import GraphConfig, Tracks
+from sst_graph.graph.matching import Tracks
 from sst_graph.graph.outer_loop import (
     KERNELS_PX,
     NARROW_KERNELS_PX,
@@ -113,10 +113,6 @@ class CalibrationProblem:
         # Without the tracks of objects.
         problem = StartProblem(self.drives, Tracks(self.drives), self.config.classes, self.guess)
         return run_to_end(select_start_steps(problem, self.config.noise, self.config.search))
-
-    def with_noise(self, noise: GraphConfig) -> CalibrationProblem:
-        """The problem with another noise of the joint graph."""
-        return replace(self, config=replace(self.config, noise=noise))
 
     def with_lower_edges(self, solutions: Sequence[JointSolution]) -> WithLowerEdges:
         """Solutions with the lower edges of classes whose labels agree about them.

@@ -8,12 +8,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from sst_graph.errors import ConfigError
-from sst_graph.files import FileKind
+from sst_graph.files import OutputFileKind
 
-RESULT_FILE = FileKind("a calibration.json", lambda head: b'"sst-graph/calibration"' in head)
-CHECKPOINT_FILE = FileKind("a checkpoint of the tracker", lambda head: b"head.npy" in head[:64])
-RERUN_FILE = FileKind("a recording of rerun", lambda head: head.startswith(b"RRF"))
-PNG_FILE = FileKind("a PNG", lambda head: head.startswith(b"\x89PNG\r\n"))
+RESULT_FILE = OutputFileKind("a calibration.json", lambda head: b'"sst-graph/calibration"' in head)
+CHECKPOINT_FILE = OutputFileKind("a checkpoint of the tracker", lambda head: b"head.npy" in head[:64])
+RERUN_FILE = OutputFileKind("a recording of rerun", lambda head: head.startswith(b"RRF"))
+PNG_FILE = OutputFileKind("a PNG", lambda head: head.startswith(b"\x89PNG\r\n"))
 
 _NO_PATHS = ("dataset", "none", "initial")
 """Choices of ``--init`` and ``--before`` that are no files."""

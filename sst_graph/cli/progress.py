@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sized
+from collections.abc import Callable, Iterable, Iterator, Sized
+from functools import partial
 from types import TracebackType
 from typing import TypeVar
 
@@ -13,6 +14,8 @@ from tqdm import tqdm
 from sst_graph.cli.messages import complain, loudness
 
 T = TypeVar("T")
+ProgressStage = Callable[[int, int], None]
+"""Called with (steps done, steps in all) of one stage."""
 
 FIRST_S, EVERY_S = 2.0, 10.0
 """A stage that takes longer than the first has a line, and another each time the second has gone by [s]."""
@@ -51,8 +54,8 @@ class ProgressBar:
             self._bar.update(done - self._bar.n)
 
     def stage(self, name: str) -> ProgressStage:
-        """Callable ``(done, total)`` for one stage."""
-        return ProgressStage(self, name)
+        """What shows the progress of one stage."""
+        return partial(self, name)
 
     def _say_line(self, done: int) -> None:
         now_s = time.monotonic()
@@ -65,16 +68,6 @@ class ProgressBar:
         if self._bar is not None:
             self._bar.close()
             self._bar = None
-
-
-class ProgressStage:
-    """Callable ``(done, total)`` that shows the progress of one stage."""
-
-    def __init__(self, bar: ProgressBar, name: str) -> None:
-        self._bar, self._name = bar, name
-
-    def __call__(self, done: int, total: int) -> None:
-        self._bar(self._name, done, total)
 
 
 def counted(items: Iterable[T], sized: Sized, stage: ProgressStage) -> Iterator[T]:

@@ -37,7 +37,8 @@ OF_ONE_DRIVE = ("sequence", "frames")
 
 def options_of(args: argparse.Namespace) -> dict[str, Any]:
     """How the command line says that its drives are to be read, defaults filled in; also in ``args``."""
-    options = {name: _given(args, name, default) for name, default in SOURCE_DEFAULTS.items()}
+    given = {name: value for name in SOURCE_DEFAULTS if (value := getattr(args, name, None)) is not None}
+    options = {**SOURCE_DEFAULTS, **given}
     for name, value in options.items():
         setattr(args, name, value)
     return options
@@ -198,11 +199,6 @@ def _checked_options(read_as: Mapping[str, Any], place: Path) -> dict[str, Any]:
             expected = "a text" if kind is str else "a number"
             raise DataError(f"{place}: read_as.{name}", f"{value!r:.60}", expected)
     return stored
-
-
-def _given(args: argparse.Namespace, name: str, default: str | int | float | None) -> Any:
-    value = getattr(args, name, None)
-    return default if value is None else value
 
 
 def _flag(name: str) -> str:

@@ -26,7 +26,7 @@ from sst_graph.errors import ConfigError, count_of
 from sst_graph.files import atomic_directory
 from sst_graph.files.strict_json import strict_json
 from sst_graph.inspect.report import Comparison, summary
-from sst_graph.result import RIG_NAME, CalibrationResult, result_file
+from sst_graph.result import RIG_NAME, result_file
 from sst_graph.rig import KnownPose, KnownRig, RelativePose, RigResult, calibrate_rig, read_rig
 from sst_graph.rig.known import ROTATION_SIGMA_DEG, TRANSLATION_SIGMA_M, poses_by_nominal
 from sst_graph.rig.known_files import read_known_poses
@@ -86,10 +86,12 @@ def run_rig(args: argparse.Namespace, cameras: Sequence[str]) -> int:
             # The numbers first: what follows may find the disk full.
             if not args.json:
                 _mention_rig(rig, against)
-            files = {
-                name: _write_camera(folder / folders[name], result, sources[name], against[name], args)
-                for name, result in rig.cameras.items()
-            }
+            files = {}
+            for name, result in rig.cameras.items():
+                own = folder / folders[name]
+                own.mkdir()
+                with_report = not args.no_report
+                files[name] = write_calibration(own, result, sources[name], against[name], with_report)
             (folder / RIG_NAME).write_text(rig.to_json(), encoding="utf-8")
             written = [RIG_NAME, *(f"{folders[name]}/{file}" for name in files for file in files[name])]
             for name, video in zip(cameras, videos, strict=False):
@@ -149,17 +151,6 @@ def _mention_rig(rig: RigResult, against: Mapping[str, Comparison | None]) -> No
     for name, result in rig.cameras.items():
         mention(f"{'camera':<15} {name}\n{summary(result, against[name])}\n")
     mention("\n".join(f"{name:<15} {text}".rstrip() for name, text in rig_lines(rig)))
-
-
-def _write_camera(
-    folder: Path,
-    result: CalibrationResult,
-    sources: Sequence[Source],
-    against: Comparison | None,
-    args: argparse.Namespace,
-) -> list[str]:
-    folder.mkdir()
-    return write_calibration(folder, result, sources, against, not args.no_report)
 
 
 def _opened(

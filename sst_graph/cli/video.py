@@ -19,14 +19,14 @@ from sst_graph.cli.pictures import ShownFrame, overlay
 from sst_graph.cli.progress import ProgressBar
 from sst_graph.data.frame_parts import RecentReader, scan_positions
 from sst_graph.errors import ConfigError, DataError
-from sst_graph.files import FileKind, OutputFile, output_file
+from sst_graph.files import OutputFile, OutputFileKind, output_file
 from sst_graph.odometry.sweep import with_sweep_of
 from sst_graph.result import CalibrationResult
 from sst_graph.types import Source
 from sst_graph.viz import Placement
 from sst_graph.viz.video import check_video_name, write_video
 
-VIDEO_FILE = FileKind("a video", lambda head: head[4:8] == b"ftyp" or head.startswith(b"GIF8"))
+VIDEO_FILE = OutputFileKind("a video", lambda head: head[4:8] == b"ftyp" or head.startswith(b"GIF8"))
 
 _INTERVALS = 9
 """So many intervals of the first scans tell the rate of a drive."""

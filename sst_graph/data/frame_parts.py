@@ -58,7 +58,7 @@ def frame_at(source: Source, position: int) -> Frame:
     """
     if isinstance(source, SeparateReader):
         return source[position]
-    place = _place(source, position)
+    place = f"{source.name}, frame at position {position}"
     frame = checked_frame(source[position], place)
     scan, image = frame.scan, frame.image
     if scan is not None:
@@ -97,10 +97,6 @@ class NumberedFrames:
         image = image_at(self.source, self.positions[number])
         place = f"{self.source.name}, frame {number}"
         return None if image is None else checked_image(image, self.source.camera, place)
-
-
-def _place(source: Source, position: int) -> str:
-    return f"{source.name}, frame at position {position}"
 
 
 def scan_positions(source: Source) -> Sequence[int]:

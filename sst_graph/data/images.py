@@ -56,7 +56,7 @@ def read_picture(path: Path, size: Size | None = None) -> NDArray[np.uint8]:
         DataError: a missing, truncated or damaged file, or one of another size.
     """
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    return _decode(path, flags, size).astype(np.uint8, copy=False)
+    return _decoded(read_file(path, IMAGE), flags, path, size).astype(np.uint8, copy=False)
 
 
 def decoded_picture(data: bytes, place: str | Path) -> NDArray[np.uint8]:
@@ -130,10 +130,6 @@ def _one_channel(image: NDArray[Any], data: bytes, place: str | Path) -> NDArray
             raise DataError(place, found, "one channel of class numbers, without colours")
         image = channels[:, :, 0]
     return np.ascontiguousarray(image)
-
-
-def _decode(path: Path, flags: int, size: Size | None) -> NDArray[Any]:
-    return _decoded(read_file(path, IMAGE), flags, path, size)
 
 
 def _decoded(data: bytes, flags: int, path: str | Path, size: Size | None) -> NDArray[Any]:

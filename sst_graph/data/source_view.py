@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import gtsam
 
 from sst_graph.data.frame_parts import image_at, image_positions, number_at, scan_at, scan_positions
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.types import CameraImage, GroundTruth, Scan, Source
+from sst_graph.types import CameraImage, Frame, GroundTruth, Scan, Source
 
 
 class SourceView:
@@ -54,6 +54,13 @@ class SourceView:
 
     def __len__(self) -> int:
         return len(self.source)
+
+    def __getitem__(self, position: int) -> Frame:
+        """Frame at a position; IndexError as the source's own."""
+        raise NotImplementedError
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (self[position] for position in range(len(self)))
 
     def frame_number(self, position: int) -> int:
         """Index of the frame at a position."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -78,22 +79,15 @@ class Place:
 
 
 @dataclass(frozen=True, eq=False)
-class TwoClockSource:
-    """Frames in the order of their stamps (satisfies :class:`~sst_graph.types.Source`); a slice is one, too.
-
-    A frame holds a scan or an image; both where their stamps are equal. Made by :func:`merged`.
+class IndexedSource(ABC):
+    """What sources of files and bags have in common: frames by their indices, and what holds for all of them.
 
     Attributes:
         properties: what holds for every frame.
-        scans, images: of the whole drive.
-        places: scan and image of every frame of the whole drive.
-        indices: the frames of this part of the drive, as positions in ``places``.
+        indices: of the frames, among those of the whole drive.
     """
 
     properties: DriveProperties
-    scans: Sensor[Scan]
-    images: Sensor[CameraImage]
-    places: tuple[Place, ...]
     indices: tuple[int, ...]
 
     @property
@@ -127,6 +121,36 @@ class TwoClockSource:
         """The instant that a scan's stamp names where times follow from azimuths."""
         return self.properties.sweep_stamp
 
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    @abstractmethod
+    def __getitem__(self, position: int) -> Frame: ...
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (self[position] for position in range(len(self)))
+
+    def frame_number(self, position: int) -> int:
+        """Index of the frame at a position; nothing is read."""
+        return self.indices[position]
+
+
+@dataclass(frozen=True, eq=False)
+class TwoClockSource(IndexedSource):
+    """Frames in the order of their stamps (satisfies :class:`~sst_graph.types.Source`); a slice is one, too.
+
+    A frame holds a scan or an image; both where their stamps are equal. Made by :func:`merged`. ``indices``
+    are positions in ``places``.
+
+    Attributes:
+        scans, images: of the whole drive.
+        places: scan and image of every frame of the whole drive.
+    """
+
+    scans: Sensor[Scan]
+    images: Sensor[CameraImage]
+    places: tuple[Place, ...]
+
     @cached_property
     def scan_positions(self) -> list[int]:
         """Positions of the frames that have a scan."""
@@ -136,9 +160,6 @@ class TwoClockSource:
     def image_positions(self) -> list[int]:
         """Positions of the frames that have an image."""
         return [k for k, index in enumerate(self.indices) if self.places[index].image is not None]
-
-    def __len__(self) -> int:
-        return len(self.indices)
 
     @overload
     def __getitem__(self, position: int) -> Frame: ...
@@ -154,13 +175,6 @@ class TwoClockSource:
         if isinstance(position, slice):
             return replace(self, indices=self.indices[position])
         return Frame(self.indices[position], self.read_scan(position), self.read_image(position))
-
-    def __iter__(self) -> Iterator[Frame]:
-        return (self[position] for position in range(len(self)))
-
-    def frame_number(self, position: int) -> int:
-        """Index of the frame at a position; nothing is read."""
-        return self.indices[position]
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -234,8 +248,7 @@ def merged(
             properties = replace(properties, truth=truth)
     properties = replace(properties, sweep=options.sweep, sweep_stamp=options.sweep_stamp)
     places = _places(scans.stamps_ns, images.stamps_ns)
-    indices = _selected(places, options)
-    return TwoClockSource(properties, scans, images, places, indices)
+    return TwoClockSource(properties, _selected(places, options), scans, images, places)
 
 
 def _places(scan_stamps_ns: NDArray[np.int64], image_stamps_ns: NDArray[np.int64]) -> tuple[Place, ...]:

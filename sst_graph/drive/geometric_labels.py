@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -28,9 +27,6 @@ class GeometricallyLabelled(SourceView):
         """Frame at a position; IndexError as the source's own."""
         frame = frame_at(self.source, position)
         return frame if frame.scan is None else replace(frame, scan=labelled_by_geometry(frame.scan))
-
-    def __iter__(self) -> Iterator[Frame]:
-        return (self[position] for position in range(len(self)))
 
     def read_scan(self, position: int) -> Scan | None:
         """Scan of the frame at a position."""

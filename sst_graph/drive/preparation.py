@@ -15,7 +15,6 @@ from sst_graph.config import Settings, internal
 from sst_graph.data.frame_parts import NumberedFrames
 from sst_graph.drive.geometric_labels import labelled_by_geometry
 from sst_graph.drive.input_statistics import InputStatistics, StatisticsCollector
-from sst_graph.drive.twists import GrowingTwists, SensorTwists
 from sst_graph.errors import DataError, count_of
 from sst_graph.factors.arguments import checked_callback
 from sst_graph.factors.camera import PinholeCamera
@@ -306,14 +305,6 @@ class Drive:
         """Median interval between scans [s]; 0.1 for a single one."""
         stamps = self.scan_stamps_ns
         return float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else 0.1
-
-    def lidar_twists(self, growing: GrowingTwists | None) -> SensorTwists | None:
-        """Twists of the LiDAR over time, smoothed, exactly zero at standstill; None for a single scan.
-
-        Args:
-            growing: cache that holds the motions of earlier calls.
-        """
-        return (growing or GrowingTwists()).of(self.lidar_motions)
 
 
 def prepare_drive(

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +14,7 @@ from sst_graph.config import Settings, setting
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import Progress
 from sst_graph.errors import ConfigError, count_of
+from sst_graph.experiments.starts import error_of
 from sst_graph.experiments.wrong_drives import WRONG, with_line_delay
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
 
@@ -170,17 +170,16 @@ def _calibrated(drive: KeptDrive, case: tuple[int, str, float], config: Assumpti
     settings = config.calibration
     result = calibrate_prepared(prepare_drives([drive], settings), drive.nominal, settings)
     assert drive.truth is not None
-    step = np.asarray(gtsam.Pose3.Logmap(result.T_camera_lidar.between(drive.truth.cTl)))
-    error = np.append(step, (drive.truth.time_offset_s or 0.0) - result.time_offset_s)
-    told = {
+    error = error_of(result.T_camera_lidar, result.time_offset_s, drive.truth)
+    report = result.diagnostics.get("assumptions", {})
+    estimates = {
         name: (entry["estimate"], entry["estimate_sigma"])
-        for name, entry in result.diagnostics.get("assumptions", {}).items()
+        for name, entry in report.items()
         if "estimate" in entry
     }
-    report = result.diagnostics.get("assumptions", {})
-    against = [name for name in told if report[name]["contradicted"]]
-    against.sort(key=lambda name: -abs(told[name][0]) / told[name][1])
-    return Run(*case, result.status, error, result.covariance, told, tuple(against))
+    against = [name for name in estimates if report[name]["contradicted"]]
+    against.sort(key=lambda name: -abs(estimates[name][0]) / estimates[name][1])
+    return Run(*case, result.status, error, result.covariance, estimates, tuple(against))
 
 
 def table(runs: Sequence[Run], in_sigmas: bool = False) -> str:

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,9 +13,8 @@ from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drive
 from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import Progress
 from sst_graph.errors import ConfigError
-from sst_graph.experiments.starts import start_near
+from sst_graph.experiments.starts import error_of, start_near
 from sst_graph.simulator import SimulationConfig, simulate
-from sst_graph.types import GroundTruth
 
 FloatArray = NDArray[np.float64]
 
@@ -111,14 +109,9 @@ def _run(drive: Mapping[str, Any], seed: int, config: ConsistencyConfig) -> Run:
     rng = np.random.default_rng([seed, 11])
     start = start_near(simulated.truth.cTl, config.start_deg, config.start_m, rng)
     result = calibrate_prepared(prepared, start, config.calibration)
-    error = _error(result.T_camera_lidar, result.time_offset_s, simulated.truth)
+    error = error_of(result.T_camera_lidar, result.time_offset_s, simulated.truth)
     not_converged = result.status == "not_converged" or not result.frames_used
     return Run(error, result.covariance, not_converged, offset_observable=drive["motion"] != "standing")
-
-
-def _error(cTl: gtsam.Pose3, time_offset_s: float, truth: GroundTruth) -> FloatArray:
-    """Truth minus estimate in the estimate's tangent space (7,) [rad, m, s]."""
-    return np.append(gtsam.Pose3.Logmap(cTl.between(truth.cTl)), (truth.time_offset_s or 0.0) - time_offset_s)
 
 
 _HEADER = (

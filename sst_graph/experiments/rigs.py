@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sst_graph.batch import CalibrationConfig
 from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import Progress
+from sst_graph.experiments.starts import error_of
 from sst_graph.rig.adjustment import adjusted
 from sst_graph.rig.calibrate import calibrate_rig_prepared, prepare_rig
 from sst_graph.rig.influences import UNKNOWNS
@@ -139,12 +140,8 @@ def _measured(rig: Mapping[str, SimulatedDrive], seed: int) -> KnownPose:
 
 def _errors(marginal: RigMarginal, truths: Sequence[GroundTruth]) -> FloatArray:
     """(n, 7) truth less estimate of each camera, in the estimate's tangent space [rad, m, s]."""
-    found = []
     estimates = zip(marginal.extrinsics, marginal.time_offsets_s, truths, strict=True)
-    for cTl, time_offset_s, truth in estimates:
-        step = gtsam.Pose3.Logmap(cTl.between(truth.cTl))
-        found.append(np.append(step, (truth.time_offset_s or 0.0) - time_offset_s))
-    return np.stack(found)
+    return np.stack([error_of(*estimate) for estimate in estimates])
 
 
 def _nees(error: FloatArray, covariance: FloatArray) -> float:

@@ -52,11 +52,6 @@ MEASURES = {
 """Errors, the trajectory's first, and the digits that the table shows."""
 
 
-def _as_drawn() -> CalibrationConfig:
-    """Contours where the masks have them: on small images following the picture brings nothing."""
-    return CalibrationConfig(image_edges=False)
-
-
 @dataclass(frozen=True)
 class SlamConfig(Settings):
     """Streets and settings.
@@ -93,7 +88,8 @@ class SlamConfig(Settings):
     loop_every: int = setting(4, at_least=1, at_most=100_000)
     loop_min_s: float = setting(2.0, at_least=0.001, at_most=1e6)
     camera: CameraGraphConfig = field(default_factory=CameraGraphConfig)
-    calibration: CalibrationConfig = field(default_factory=_as_drawn)
+    # Contours where the masks have them: on small images following the picture brings nothing.
+    calibration: CalibrationConfig = field(default_factory=lambda: CalibrationConfig(image_edges=False))
 
 
 @dataclass(frozen=True)

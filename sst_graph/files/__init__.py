@@ -28,13 +28,13 @@ from sst_graph.files.output import (
     output_file,
 )
 from sst_graph.files.staging import abandon_all, when_safe
-from sst_graph.files.targets import TEXT, FileKind, check_file_target, check_folder_target
+from sst_graph.files.targets import TEXT, OutputFileKind, check_file_target, check_folder_target
 
 __all__ = [
     "MANIFEST",
     "TEXT",
-    "FileKind",
     "OutputFile",
+    "OutputFileKind",
     "OutputKind",
     "abandon_all",
     "atomic_directory",

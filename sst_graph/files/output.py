@@ -18,7 +18,7 @@ from sst_graph.errors import ConfigError
 from sst_graph.files import staging
 from sst_graph.files.manifest import OutputKind, carry_over, give_back, write_manifest
 from sst_graph.files.staging import Stage, claim, uninterrupted
-from sst_graph.files.targets import TEXT, FileKind, check_file_target, check_folder_target, real_path
+from sst_graph.files.targets import TEXT, OutputFileKind, check_file_target, check_folder_target, real_path
 
 _NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)
 """Errors of a file system without hard links."""
@@ -144,7 +144,7 @@ class OutputFile:
 
 
 @contextmanager
-def output_file(path: str | Path, overwrite: bool, kind: FileKind = TEXT) -> Iterator[OutputFile]:
+def output_file(path: str | Path, overwrite: bool, kind: OutputFileKind = TEXT) -> Iterator[OutputFile]:
     """A file to be written in the block, whose name is taken on entry.
 
     Raises:

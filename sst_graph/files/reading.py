@@ -218,15 +218,11 @@ def _check_values(value: Any, max_depth: int) -> None:
             elif isinstance(item, list):
                 below.extend(item)
             elif isinstance(item, str):
-                _check_text(item)
+                if not item.isascii() and any("\ud800" <= c <= "\udfff" for c in item):
+                    raise ValueError("a lone surrogate in a string")
             elif isinstance(item, int) and abs(item) >= 10**MAX_DIGITS:
                 raise ValueError(f"a whole number of more than {MAX_DIGITS} digits")
         level = below
-
-
-def _check_text(text: str) -> None:
-    if not text.isascii() and any("\ud800" <= c <= "\udfff" for c in text):
-        raise ValueError("a lone surrogate in a string")
 
 
 def _whole_number(text: str) -> int:

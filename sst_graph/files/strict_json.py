@@ -21,7 +21,7 @@ def strict_json(document: Mapping[str, Any]) -> str:
 
     Text that is not Unicode (lone surrogates) is escaped, so that the whole can be written as UTF-8.
     """
-    return _LONE_SURROGATE.sub(_escaped, _dump(json_able(document)))
+    return _LONE_SURROGATE.sub(lambda match: f"\\\\u{ord(match[0]):04x}", _dump(json_able(document)))
 
 
 def json_able(value: Any) -> Any:
@@ -54,7 +54,3 @@ def _dump(document: dict[str, Any]) -> str:
         else:
             entries.append(f"  {json.dumps(key)}: {json.dumps(value, allow_nan=False, ensure_ascii=False)}")
     return "{\n" + ",\n".join(entries) + "\n}"
-
-
-def _escaped(match: re.Match[str]) -> str:
-    return f"\\\\u{ord(match[0]):04x}"

@@ -16,7 +16,7 @@ _HEAD = 4096
 
 
 @dataclass(frozen=True)
-class FileKind:
+class OutputFileKind:
     """A kind of file that a command writes.
 
     Attributes:
@@ -37,10 +37,10 @@ def is_text(head: bytes) -> bool:
     return b"\0" not in head
 
 
-TEXT = FileKind("a text file", is_text)
+TEXT = OutputFileKind("a text file", is_text)
 
 
-def check_file_target(path: str | Path, overwrite: bool, kind: FileKind) -> None:
+def check_file_target(path: str | Path, overwrite: bool, kind: OutputFileKind) -> None:
     """Refuse an output file that cannot be made, or must not be replaced; ask before work begins.
 
     Args:

@@ -62,7 +62,9 @@ def matches(value: Any, hint: Any) -> bool:
             matches(k, key) and matches(one, item) for k, one in value.items()
         )
     if origin in _SEVERAL:
-        return _is_kind(value, origin) and all(matches(item, arguments[0]) for item in value)
+        # A text is a sequence, but none that a field of many means.
+        several = isinstance(value, origin) and not isinstance(value, str)
+        return several and all(matches(item, arguments[0]) for item in value)
     return _matches_plain(value, hint)
 
 
@@ -78,11 +80,6 @@ def _matches_plain(value: Any, hint: Any) -> bool:
     if not isinstance(hint, type) or getattr(hint, "_is_protocol", False):
         return True
     return isinstance(value, hint)
-
-
-def _is_kind(value: Any, origin: Any) -> bool:
-    """A text is a sequence, but none that a field of many means."""
-    return isinstance(value, origin) and not isinstance(value, str)
 
 
 def _matches_tuple(value: Any, arguments: tuple[Any, ...]) -> bool:

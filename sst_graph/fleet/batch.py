@@ -17,16 +17,16 @@ from pathlib import Path
 from sst_graph.config import Settings, setting
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.files.json_table import json_table
-from sst_graph.files.reading import FileKind, digest_of_file, parse_json
+from sst_graph.files.reading import FileKind, digest_of_file
 from sst_graph.files.staging import lock_file
 from sst_graph.files.strict_json import strict_json
 from sst_graph.fleet.attempt import DRIVES, RECORDS, Job, finished_record, run_drive
-from sst_graph.fleet.dask_pool import Cluster, run_on_dask
+from sst_graph.fleet.dask_pool import run_on_dask
 from sst_graph.fleet.drives import Drive, vehicle_files
 from sst_graph.fleet.isolated import Limits
 from sst_graph.fleet.local_pool import run_locally
 from sst_graph.fleet.places import Place, read_many
-from sst_graph.fleet.record import Record
+from sst_graph.fleet.record import Record, json_of
 from sst_graph.fleet.scratch import sweep_scratch
 from sst_graph.fleet.summary.page import summary_html
 from sst_graph.fleet.summary.tables import Row, csv_bytes, drive_rows, parquet_bytes, vehicle_rows
@@ -42,8 +42,6 @@ VEHICLES = "vehicles"
 
 _NAME_FILES = ("--config", "--init", "--image-model", "--lidar-model")
 _OPTION_FILE = FileKind("a file that an option names", 2**36)
-
-Told = Callable[["Progress"], None]
 
 
 @dataclass(frozen=True)
@@ -130,9 +128,7 @@ def open_batch(out: Place, options: Sequence[str]) -> Iterator[None]:
         raise ConfigError(f"{out}: found a file, expected a folder or nothing")
     if (out / BATCH).exists():
         place = (out / BATCH).url
-        table = json_table(
-            parse_json(_utf8((out / BATCH).read(), place), place, BATCH), place, FORMAT, VERSION
-        )
+        table = json_table(json_of((out / BATCH).read(), place, BATCH), place, FORMAT, VERSION)
         before = [str(one) for one in table.sequence("options")]
         _check_files(out, table.mapping("files"), options)
         if before != list(options):
@@ -182,13 +178,13 @@ def run_batch(
     drives: Sequence[Drive],
     out: Place,
     config: BatchConfig,
-    told: Told,
+    progress: Callable[[Progress], None],
     run: Callable[[Job], Record] = run_drive,
 ) -> dict[str, Record]:
     """Run all drives that have no result yet; the records of all, by name.
 
     Args:
-        told: is called after every drive, and now and then between.
+        progress: is called after every drive, and now and then between.
         run: what is done for a drive; it does not raise, and Dask can send it to its workers.
 
     Raises:
@@ -200,16 +196,16 @@ def run_batch(
     left = [job for job in jobs if job.drive.name not in records]
     earlier, started = len(records), time.monotonic()
     failed = 0
-    told(Progress(earlier, len(jobs), earlier, failed, 0.0))
+    progress(Progress(earlier, len(jobs), earlier, failed, 0.0))
     if config.dask and left:
-        coming = run_on_dask(left, Cluster(config.dask, config.workers), run)
+        coming = run_on_dask(left, config.dask, config.workers, run)
     else:
         coming = run_locally(left, config.workers, run)
     for record in coming:
         if record is not None:
             records[record.drive] = record
             failed += not record.has_result
-        told(Progress(len(records), len(jobs), earlier, failed, time.monotonic() - started, record))
+        progress(Progress(len(records), len(jobs), earlier, failed, time.monotonic() - started, record))
     return records
 
 
@@ -297,10 +293,3 @@ def _locked(out: Place) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
-
-
-def _utf8(data: bytes, place: str) -> str:
-    try:
-        return data.decode("utf-8")
-    except UnicodeDecodeError:
-        raise DataError(place, "bytes that are no UTF-8", BATCH) from None

@@ -13,7 +13,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager
 from itertools import islice
 from typing import Any
 
@@ -34,35 +34,26 @@ _AHEAD = 4
 """Tasks at the scheduler for each that can run: enough that none waits, few enough for its memory."""
 
 
-@dataclass(frozen=True)
-class Cluster:
-    """Which cluster.
-
-    Attributes:
-        address: of its scheduler, such as tcp://host:8786, or :data:`LOCAL`.
-        workers: of a local cluster.
-    """
-
-    address: str
-    workers: int
-
-
 def run_on_dask(
-    jobs: Iterable[Job], cluster: Cluster, run: Callable[[Job], Record]
+    jobs: Iterable[Job], address: str, workers: int, run: Callable[[Job], Record]
 ) -> Iterator[Record | None]:
     """The records of all jobs, as they are done; None now and then while there is none.
+
+    Args:
+        address: of the cluster's scheduler, such as tcp://host:8786, or :data:`LOCAL`.
+        workers: of a local cluster.
 
     Raises:
         ConfigError: no scheduler answers, or it is lost.
         MissingDependencyError: dask.distributed is not installed.
     """
     distributed = _distributed()
-    with _client(distributed, cluster) as client:
+    with _client(distributed, address, workers) as client:
         waiting = iter(jobs)
         running: dict[Any, Job] = {}
         alone: deque[Job] = deque()
         rounds: Counter[str] = Counter()
-        renewal = _Renewal(client.cluster if cluster.address == LOCAL else None, cluster.workers)
+        renewal = _Renewal(client.cluster if address == LOCAL else None, workers)
 
         def submit(job: Job) -> None:
             name = job.drive.name
@@ -70,9 +61,9 @@ def run_on_dask(
             running[client.submit(run, job, pure=False, key=f"sst-graph-{name}-{rounds[name]}")] = job
 
         while True:
-            workers = client.scheduler_info(n_workers=-1)["workers"].values()
-            renewal.look(len(workers))
-            threads = sum(one["nthreads"] for one in workers)
+            there = client.scheduler_info(n_workers=-1)["workers"].values()
+            renewal.look(len(there))
+            threads = sum(one["nthreads"] for one in there)
             for job in islice(waiting, max(_AHEAD * max(threads, 1) - len(running), 0)):
                 submit(job)
             if not running and alone:
@@ -89,7 +80,7 @@ def run_on_dask(
                 continue
             except CancelledError:
                 raise ConfigError(
-                    f"--dask {cluster.address}: lost the scheduler with "
+                    f"--dask {address}: lost the scheduler with "
                     f"{count_of(len(running), 'drive')} at it; "
                     "the same command goes on from here, on this one or another"
                 ) from None
@@ -139,18 +130,26 @@ def _failure(job: Job, error: BaseException, is_lost: bool) -> Record:
     return Record(name, place, "crash", f"could not be run on its Dask worker: {one_line(error):.500}")
 
 
-def _client(distributed: Any, cluster: Cluster) -> Any:
-    try:
-        if cluster.address == LOCAL:
-            # Its scheduler and nannies run in this process: what they do every minute is no news here.
-            logging.getLogger("distributed").setLevel(logging.WARNING)
-            local = distributed.LocalCluster(
-                n_workers=cluster.workers, threads_per_worker=1, processes=True, dashboard_address=None
-            )
-            return _OwnCluster(distributed, local)
-        return distributed.Client(cluster.address, timeout=_CONNECT_S)
-    except (OSError, ValueError, TimeoutError) as error:
-        raise ConfigError(f"--dask {cluster.address}: found no scheduler ({error})") from error
+@contextmanager
+def _client(distributed: Any, address: str, workers: int) -> Iterator[Any]:
+    """A client of the scheduler; a local cluster is closed with it."""
+    with ExitStack() as stack:
+        try:
+            place, patience = address, {"timeout": _CONNECT_S}
+            if address == LOCAL:
+                # Its scheduler and nannies run in this process: what they do every minute is no news here.
+                logging.getLogger("distributed").setLevel(logging.WARNING)
+                place, patience = (
+                    distributed.LocalCluster(
+                        n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None
+                    ),
+                    {},
+                )
+                stack.callback(place.close)
+            client = stack.enter_context(distributed.Client(place, **patience))
+        except (OSError, ValueError, TimeoutError) as error:
+            raise ConfigError(f"--dask {address}: found no scheduler ({error})") from error
+        yield client
 
 
 class _Renewal:
@@ -170,20 +169,6 @@ class _Renewal:
             self._cluster.scale(0)
             self._cluster.scale(self._workers)
             self._last_seen = now
-
-
-class _OwnCluster:
-    """A client that closes its cluster, too."""
-
-    def __init__(self, distributed: Any, cluster: Any) -> None:
-        self._cluster, self._client = cluster, distributed.Client(cluster)
-
-    def __enter__(self) -> Any:
-        return self._client.__enter__()
-
-    def __exit__(self, *error: Any) -> None:
-        self._client.__exit__(*error)
-        self._cluster.close()
 
 
 def _distributed() -> Any:

@@ -103,10 +103,10 @@ def with_vehicles(drives: Sequence[Drive], given: str) -> list[Drive]:
         ConfigError: no such expression, or it fits no drive; two vehicles whose files have one name.
         DataError: the CSV cannot be read, or has two rows of one drive.
     """
-    told = _by_table(given) if given.lower().endswith(".csv") else _by_expression(given)
+    row_of = _by_table(given) if given.lower().endswith(".csv") else _by_expression(given)
     found = []
     for drive in drives:
-        row = told(drive)
+        row = row_of(drive)
         date = _checked_date(row.get("date") or drive.date, f"--vehicle-from {given}: {drive.place}")
         found.append(replace(drive, vehicle=(row.get("vehicle") or drive.vehicle).strip(), date=date))
     if not any(drive.vehicle for drive in found):
@@ -145,10 +145,10 @@ def _by_table(given: str) -> Callable[[Drive], Mapping[str, str | None]]:
             if known.setdefault(key, row) != row:
                 raise DataError(given, f"two rows of the drive {row['drive']}", "one vehicle and one date")
 
-    def told(drive: Drive) -> Mapping[str, str | None]:
+    def row_of(drive: Drive) -> Mapping[str, str | None]:
         return known.get(drive.name) or known.get(drive.place.whole()) or {}
 
-    return told
+    return row_of
 
 
 def _by_expression(given: str) -> Callable[[Drive], Mapping[str, str | None]]:
@@ -162,13 +162,13 @@ def _by_expression(given: str) -> Callable[[Drive], Mapping[str, str | None]]:
         raise ConfigError(f"--vehicle-from {given!r}: found no group, expected (?P<vehicle>...)")
     group = "vehicle" if "vehicle" in names else unnamed[0]
 
-    def told(drive: Drive) -> Mapping[str, str | None]:
+    def row_of(drive: Drive) -> Mapping[str, str | None]:
         match = expression.search(drive.place.url)
         if match is None:
             return {}
         return {"vehicle": match.group(group), "date": match.groupdict().get("date")}
 
-    return told
+    return row_of
 
 
 def _of_list(place: Place, name_parts: int) -> list[Drive]:

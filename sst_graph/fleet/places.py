@@ -9,12 +9,13 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sst_graph.errors import DataError, MissingDependencyError, one_line
+from sst_graph.errors import DataError, MissingDependencyError, SstGraphError, one_line
 from sst_graph.files import MANIFEST, atomic_write_bytes
 
 _URL = re.compile(r"^[a-z][a-z0-9+.-]*://", re.IGNORECASE)
@@ -229,20 +230,14 @@ def read_many(places: Iterable[Place]) -> dict[Place, bytes]:
     return found
 
 
-class _asked:
+@contextmanager
+def _asked(place: Place) -> Iterator[None]:
     """Errors of a storage as :class:`DataError`, whatever its package calls them."""
-
-    def __init__(self, place: Place) -> None:
-        self._place = place
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        from sst_graph.errors import SstGraphError
-
-        if isinstance(error, SstGraphError) or not isinstance(error, Exception):
-            return
-        if isinstance(error, FileNotFoundError):
-            raise DataError(self._place.url, "nothing", "a file or a folder") from error
-        raise DataError(self._place.url, one_line(error), "a place that can be read and written") from error
+    try:
+        yield
+    except SstGraphError:
+        raise
+    except FileNotFoundError as error:
+        raise DataError(place.url, "nothing", "a file or a folder") from error
+    except Exception as error:
+        raise DataError(place.url, one_line(error), "a place that can be read and written") from error

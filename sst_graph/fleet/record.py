@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import gtsam
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sst_graph.errors import DataError, printable
 from sst_graph.export import common_errors
 from sst_graph.files.json_table import json_table
-from sst_graph.files.reading import FileKind, parse_json
+from sst_graph.files.reading import parse_json
 from sst_graph.files.strict_json import strict_json
 from sst_graph.inspect.reasons import short_reasons
 from sst_graph.marginal import SCAN_HASHES, CalibrationMarginal, Common, hashes_in, inverse, steps_in
@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 
 FORMAT = "sst-graph/batch-record"
 VERSION = 2
-RECORD = FileKind("a record of a batch", 1024 * 1024)
+RECORD = "a record of a batch"
 
 Status = Literal[
     "ok",
@@ -169,7 +169,7 @@ class Record:
         Raises:
             DataError: no such text.
         """
-        table = json_table(parse_json(_text(data, place), place, RECORD.name), place, FORMAT, VERSION)
+        table = json_table(json_of(data, place, RECORD), place, FORMAT, VERSION)
         status, cost = table.text("status"), table.table("cost")
         if status not in get_args(Status):
             raise DataError(place, f"status {status!r:.40}", f"one of {', '.join(get_args(Status))}")
@@ -211,8 +211,13 @@ def reason_of(result: CalibrationResult) -> str:
     return printable(first + (f" ({len(others)} more in its report)" if others else ""), 1000)
 
 
-def _text(data: bytes, place: str | Path) -> str:
+def json_of(data: bytes, place: str | Path, kind: str) -> Any:
+    """The JSON in the bytes of a file of a kind.
+
+    Raises:
+        DataError: no UTF-8, or no JSON.
+    """
     try:
-        return data.decode("utf-8")
+        return parse_json(data.decode("utf-8"), place, kind)
     except UnicodeDecodeError:
-        raise DataError(place, "bytes that are no UTF-8", RECORD.name) from None
+        raise DataError(place, "bytes that are no UTF-8", kind) from None

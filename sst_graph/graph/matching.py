@@ -154,7 +154,10 @@ class Tracks:
         growing: GrowingTwists | None = None,
     ) -> None:
         """growing: of a single drive whose motions grow."""
-        self._twists: list[SensorTwists | None] = [drive.lidar_twists(growing) for drive in drives]
+        # Smoothed, exactly zero at standstill; None for a single scan.
+        self._twists: list[SensorTwists | None] = [
+            (growing or GrowingTwists()).of(drive.lidar_motions) for drive in drives
+        ]
         self.objects: Sequence[Mapping[ObjectId, int]] | None = objects
         found = zip(drives, objects, strict=True) if objects is not None else ()
         self._dynamic = [_by_scan(find_dynamic_objects(drive, tracks)) for drive, tracks in found]

@@ -24,7 +24,6 @@ from sst_graph.factors import residuals
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.fit import OuterIteration
 from sst_graph.graph.building import joint_graph
-from sst_graph.graph.convergence import OSCILLATION_SIGMAS, STEP_SIGMAS, step_share
 from sst_graph.graph.frozen_problem import FrozenPoint, FrozenProblem
 from sst_graph.graph.matching import DriveMatches, GraphConfig, PairMatches, Tracks, edges_of, match_all
 from sst_graph.graph.state import State
@@ -35,6 +34,15 @@ from sst_graph.types import SemanticClass
 FloatArray = NDArray[np.float64]
 _LOG = logging.getLogger(__name__)
 
+STEP_SIGMAS = 0.1
+"""A step shorter than this many standard deviations of the frozen problem ends the loop: what is left is
+small beside the uncertainty."""
+OSCILLATION_SIGMAS = 1.5
+"""The loop has converged if its last full step is shorter than this many standard deviations: an oscillation
+of that width is covered by the uncertainty."""
+FULL_STEPS = 6
+"""Full steps at the last kernel scale before steps are shortened; a solution that does not oscillate
+converges with fewer."""
 KERNELS_PX = (20.0, 20.0, 15.0, 15.0, 10.0, 10.0, 7.0, 7.0, 5.0, 5.0, 4.0, 3.0)
 """Schedule of the robust kernel: its scale in each outer iteration; the last one stays [px].
 
@@ -148,6 +156,16 @@ class JointSolution:
     def values(self) -> gtsam.Values:
         """Its optimum."""
         return self.frozen.values_at(self.optimum)
+
+
+def step_share(steps: int) -> float:
+    """Share of the next step that is made, after so many at the last kernel scale: 1, ..., 1, 1/2, 1/3, ...
+
+    Each outer iteration matches again. Where some matches appear and disappear in turn, the estimate
+    oscillates about a point, which is the estimate that is wanted. So after some full steps the steps are
+    shortened, and a short step ends the loop.
+    """
+    return 1.0 / (1.0 + max(0, steps - FULL_STEPS))
 
 
 def solve_joint(

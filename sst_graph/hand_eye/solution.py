@@ -19,7 +19,7 @@ from sst_graph.drive.path import SensorPath
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import EstimationError, count_of
 from sst_graph.fit import OuterIteration
-from sst_graph.graph.convergence import STEP_SIGMAS, step_share
+from sst_graph.graph.outer_loop import STEP_SIGMAS, step_share
 from sst_graph.graph.state import EXTRINSIC, State, difference, time_offset_key
 from sst_graph.hand_eye.covariance import hand_eye_covariance
 from sst_graph.hand_eye.graph import (

@@ -16,7 +16,6 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
 from sst_graph.graph.matching import GraphConfig, edges_of
 from sst_graph.graph.outer_loop import KERNELS_PX, NARROW_KERNELS_PX, JointSolution, agreement
@@ -131,7 +130,7 @@ def select_among_steps(
         EstimationError: no candidate leads to a solution near the guess.
     """
     # 1. All candidates under wide kernels, on some of the points.
-    few = [_thinned(drive, most_scans) for drive in problem.drives]
+    few = [replace(drive, scans=tuple(evenly_spread(drive.scans, most_scans))) for drive in problem.drives]
     full = RefinementProblem.of(edges_of(few, problem.tracks, graph), graph)
     rough = full.thinned(_WIDE_POINTS)
     yield 10
@@ -205,11 +204,6 @@ def _with_offsets(candidates: Sequence[Candidate], guess_time_offset_s: float) -
         return list(candidates)
     others = [replace(candidates[0], time_offset_s=guess_time_offset_s + step) for step in (0.0, 0.25, -0.25)]
     return [*candidates, *others]
-
-
-def _thinned(drive: Drive, most: int) -> Drive:
-    """The drive with at most so many scans, evenly spread."""
-    return replace(drive, scans=tuple(evenly_spread(drive.scans, most)))
 
 
 def _poses(candidates: Sequence[Candidate], biases: int) -> Poses:

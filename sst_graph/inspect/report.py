@@ -54,7 +54,7 @@ def summary(result: CalibrationResult, comparison: Comparison | None = None) -> 
             "transform",
             f"p_{'camera' if result.image_topic else result.camera_name} = T_camera_lidar . p_lidar",
         ),
-        *(("", row) for row in _matrix_rows(result.T_camera_lidar)),
+        *(("", " ".join(f"{x:10.6f}" for x in row)) for row in result.T_camera_lidar.matrix()[:3]),
         ("sigma", _pose_sigmas(result)),
         ("time offset", f"{_offset(result)}   ({OFFSET_SIGN})"),
         *(
@@ -152,10 +152,6 @@ def _sweeps(result: CalibrationResult) -> list[str]:
         f"{drive}: {entry.get('sentence', '')}" if len(decided) > 1 else str(entry.get("sentence", ""))
         for drive, entry in decided
     ]
-
-
-def _matrix_rows(pose: gtsam.Pose3) -> list[str]:
-    return [" ".join(f"{value:10.6f}" for value in row) for row in pose.matrix()[:3]]
 
 
 def _pose_sigmas(result: CalibrationResult) -> str:

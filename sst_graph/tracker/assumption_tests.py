@@ -24,16 +24,19 @@ from sst_graph.covariance.jackknife import bounded_ratio
 from sst_graph.tracker.window.gaussian import inverted
 from sst_graph.tracker.window.smoother import WindowSmoother
 
-_EVERY = 10
+EVERY = 10
 """Scans between two tests: they cost about as much as the covariance, which each frame has."""
 
 
 def score_findings(smoother: WindowSmoother, config: AssumptionConfig) -> tuple[ParameterTest, ...]:
-    """Score test of each assumption that the matches determine, the most contradicted first.
+    """Score test of each assumption that the matches determine, the most contradicted first; none where the
+    settings want none.
 
     Raises:
         EstimationError: a direction without any information.
     """
+    if not config.test:
+        return ()
     H, g, n = smoother.information(), smoother.vector(), smoother.past.point.size
     follows = -(inverted(H[:n, :n]) @ H[:n, n:])
     A = np.concatenate([follows, np.eye(smoother.past.held)])
@@ -54,41 +57,3 @@ def score_findings(smoother: WindowSmoother, config: AssumptionConfig) -> tuple[
         contradicted = abs(value) > config.threshold * sigma
         found.append(ParameterTest(assumption, value, sigma, contradicted))
     return tuple(sorted(found, key=lambda finding: -finding.score))
-
-
-class AssumptionTests:
-    """Tests of the assumptions in a running tracker, and their results.
-
-    Attributes:
-        found: findings of the last test, by name of the assumption: (value, sigma, contradicted).
-    """
-
-    def __init__(self, config: AssumptionConfig) -> None:
-        self.config = config
-        self.found: dict[str, tuple[float, float, bool]] = {}
-
-    @property
-    def findings(self) -> tuple[ParameterTest, ...]:
-        """Of the last test, the most contradicted first."""
-        return tuple(ParameterTest(ASSUMPTIONS[name], *values) for name, values in self.found.items())
-
-    def restart(self) -> None:
-        """A new calibration begins."""
-        self.found = {}
-
-    def update(self, scan: int, smoother: WindowSmoother) -> None:
-        """The smoother has used a scan of this number."""
-        if scan % _EVERY == 0:
-            self.run(smoother)
-
-    def run(self, smoother: WindowSmoother) -> None:
-        """Test now.
-
-        Raises:
-            EstimationError: a direction without any information.
-        """
-        if self.config.test:
-            self.found = {
-                finding.assumption.name: (finding.value, finding.sigma, finding.contradicted)
-                for finding in score_findings(smoother, self.config)
-            }

@@ -12,22 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.assumptions.sweep import SWEEP
-from sst_graph.batch.assumption_tests import with_test_results
+from sst_graph.batch.assumption_tests import ParameterTest, with_test_results
 from sst_graph.covariance.considered import Considered, considered_by_steps
 from sst_graph.covariance.undecided_sweep import SweepEffect
 from sst_graph.errors import EstimationError
 from sst_graph.odometry.sweep import SweepDecision
-from sst_graph.tracker.assumption_tests import AssumptionTests
+from sst_graph.tracker.assumption_tests import EVERY, score_findings
 from sst_graph.tracker.by_edges.kinds import by_edges
-from sst_graph.tracker.by_edges.review import variance_ratio
-from sst_graph.tracker.by_edges.reviews import EdgeReviews
+from sst_graph.tracker.by_edges.review import EdgeReviews, variance_ratio
 from sst_graph.tracker.config import TrackerConfig
-from sst_graph.tracker.history import History, HistoryEntry
+from sst_graph.tracker.history import MAX_EPOCHS, HistoryEntry, smoothed_epochs
 from sst_graph.tracker.monitor.statistic import ComparedEstimate
 from sst_graph.tracker.start.first_estimate import StartGuess
 from sst_graph.tracker.start.initializer import Initialization
 from sst_graph.tracker.uncertainty import Uncertainty
-from sst_graph.tracker.window.epochs import MatchedPair
+from sst_graph.tracker.window.epochs import MatchedPair, RetiredEpoch
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.tracker.window.information_log import InformationLog
 from sst_graph.tracker.window.matcher import WindowMatcher
@@ -35,8 +34,8 @@ from sst_graph.tracker.window.relinearization import (
     RelinearizationSchedule,
     WindowRelinearization,
     relinearize_window,
+    scans_to_match,
 )
-from sst_graph.tracker.window.rematching import scans_to_match
 from sst_graph.tracker.window.smoother import WindowSmoother
 
 _LOG = logging.getLogger(__name__)
@@ -76,12 +75,12 @@ class OnlineEstimate:
         guess: the calibration while there is no estimate.
         smoother: the graph of the window; None while there is no estimate.
         uncertainty: covariance of the estimate.
-        tests: whether the data contradict what is assumed.
+        findings: tests of the assumptions, the most contradicted first.
         entered: scans that have had a pair.
         schedule: when the whole window is relinearized.
         relinearization: of the whole window, while one is under way.
         information_log: what each scan contributed.
-        past_epochs: those that have left the window (drift mode).
+        past_epochs: those that have left the window since the last alarm, the latest of them (drift mode).
         starts: number of the start that the estimate comes from.
         sweep: what was decided of the sweep of the scans; None: nothing, they are used as they come.
         edges: reviews of the estimate where edges are aligned.
@@ -91,12 +90,12 @@ class OnlineEstimate:
         self.matcher, self.config, self.guess = matcher, config, guess
         self.smoother: WindowSmoother | None = None
         self.uncertainty = Uncertainty.nothing()
-        self.tests = AssumptionTests(config.calibration.assumptions)
+        self.findings: tuple[ParameterTest, ...] = ()
         self.entered: deque[int] = deque(maxlen=4 * config.window)
         self.schedule = RelinearizationSchedule(0, config.window, config.window)
         self.relinearization: WindowRelinearization | None = None
         self.information_log = InformationLog()
-        self.past_epochs = History()
+        self.past_epochs: deque[RetiredEpoch] = deque(maxlen=MAX_EPOCHS)
         self.starts = 0
         self.sweep: SweepDecision | None = None
         self.edges = EdgeReviews(config) if by_edges(matcher.classes) else None
@@ -106,8 +105,8 @@ class OnlineEstimate:
         smoother, window = initialization.smoother, self.matcher.window
         self.smoother, self.uncertainty = smoother, initialization.uncertainty
         if self.edges is not None:
-            self.edges.begin(window.next_scan, initialization.first)
-        self.tests.run(smoother)
+            self.edges.begin(window.next_scan, initialization.first.review, initialization.first.known)
+        self.findings = score_findings(smoother, self.config.calibration.assumptions)
         self.starts += 1
         soon = len(window.scans) + initialization.scans
         self.schedule = RelinearizationSchedule(window.first_scan, soon, self.config.window)
@@ -121,11 +120,11 @@ class OnlineEstimate:
         self.guess = guess
         self.stop_relinearization()
         self.smoother, self.uncertainty = None, Uncertainty.nothing()
-        self.tests.restart()
+        self.findings = ()
         if self.edges is not None:
             self.edges.restart()
         self.entered.clear()
-        self.past_epochs.cut()
+        self.past_epochs.clear()
 
     # ------------------------------------------------------------------ what is known
 
@@ -185,11 +184,6 @@ class OnlineEstimate:
         return considered + self.edges.covariance(self.smoother, self.uncertainty)
 
     @property
-    def variance_ratio(self) -> float:
-        """Of the matches (:func:`~sst_graph.tracker.by_edges.review.variance_ratio`)."""
-        return 1.0 if self.edges is None else variance_ratio(self.edges.found, self.covariance)
-
-    @property
     def reasons(self) -> tuple[str, ...]:
         """Why the estimate may be wrong altogether."""
         return () if self.edges is None else self.edges.reasons_for(self.uncertainty)
@@ -209,18 +203,19 @@ class OnlineEstimate:
     def considered(self) -> Considered:
         """The considered assumptions: those whose parameters are not estimated."""
         considered = considered_by_steps(self.uncertainty.steps, self.config.calibration.assumptions)
-        return with_test_results(considered, self.tests.findings)
+        return with_test_results(considered, self.findings)
 
     def for_comparison(self) -> ComparedEstimate:
         """The running estimate, for the comparison of new frames with it."""
         assert self.smoother is not None
-        return ComparedEstimate(self.smoother.point, self.uncertainty.joint, self.smoother.model)
+        ratio = 1.0 if self.edges is None else variance_ratio(self.edges.found, self.covariance)
+        return self.uncertainty.compared(self.smoother, ratio)
 
     def history(self) -> list[HistoryEntry]:
         """The calibration of every epoch, smoothed over all of them, with covariances (drift mode)."""
         if self.smoother is None:
             return []
-        entries = self.past_epochs.smoothed(self.smoother)
+        entries = smoothed_epochs(self.past_epochs, self.smoother)
         extra = self._shared() + self.by_sweep().covariance
         return [dataclasses.replace(entry, covariance=entry.covariance + extra) for entry in entries]
 
@@ -257,10 +252,12 @@ class OnlineEstimate:
         if new:
             self.information_log.add(window.scans[-1][1].index, self.reported_covariance())
         # 4. Test the assumptions, and whether edges still agree with the pictures.
-        self.tests.update(matches.scan, smoother)
+        if matches.scan % EVERY == 0:
+            self.findings = score_findings(smoother, self.config.calibration.assumptions)
         if self.edges is not None:
             self.edges.advance(self.matcher, smoother, self.guess.cTl)
-        self.past_epochs.take(smoother)
+        self.past_epochs.extend(smoother.retired)
+        smoother.retired.clear()
 
     def begin_relinearization(self) -> None:
         """Match the window again with the frames to come; no scan leaves meanwhile if none has yet."""
@@ -309,7 +306,7 @@ class OnlineEstimate:
                 smoother, self.matcher, max_iterations, live, self._share, self.uncertainty.inflation
             )
             self.uncertainty = Uncertainty.of(smoother)
-            self.tests.run(smoother)
+            self.findings = score_findings(smoother, self.config.calibration.assumptions)
             if self.edges is not None:
                 self.edges.finish(self.matcher, smoother, self.guess.cTl)
         except EstimationError as error:

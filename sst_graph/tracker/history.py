@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -18,7 +17,7 @@ from sst_graph.tracker.window.smoother import WindowSmoother
 
 FloatArray = NDArray[np.float64]
 
-_MAX_EPOCHS = 5000
+MAX_EPOCHS = 5000
 """Epochs kept for smoothing: nearly an hour and a half, at some kilobytes each."""
 
 
@@ -38,37 +37,22 @@ class HistoryEntry:
     covariance: FloatArray
 
 
-class History:
-    """Gaussians of the epochs that have passed since the last alarm; the oldest are forgotten."""
-
-    def __init__(self) -> None:
-        self.epochs: deque[RetiredEpoch] = deque(maxlen=_MAX_EPOCHS)
-
-    def take(self, smoother: WindowSmoother) -> None:
-        """Move the epochs that a smoother has retired here."""
-        self.epochs.extend(smoother.retired)
-        smoother.retired.clear()
-
-    def cut(self) -> None:
-        """Forget all epochs: the calibration has changed."""
-        self.epochs.clear()
-
-    def smoothed(self, smoother: WindowSmoother) -> list[HistoryEntry]:
-        """All epochs since the last break, the window's included, each given all the others."""
-        epochs = [*self.epochs, *smoother.live_epochs()]
-        walks = [smoother.walk(max(1e-3, (b.start_ns - a.start_ns) * 1e-9)) for a, b in pairwise(epochs)]
-        point = smoother.point.core()
-        beliefs = [_cluster_robust(epoch, point) for epoch in epochs]
-        forward = _messages(beliefs, walks, smoother.prior)
-        nothing = Gaussian(point, np.zeros((point.size, point.size)), np.zeros(point.size))
-        backward = _messages(beliefs[::-1], walks[::-1], nothing)[::-1]
-        entries = []
-        for epoch, belief, a, b in zip(epochs, beliefs, forward, backward, strict=True):
-            total = belief.plus(a).plus(b)
-            best = total.mean()
-            covariance = scaled_inverse(total.information)[:7, :7]
-            entries.append(HistoryEntry(epoch.start_ns, best.cTl, best.time_offset_s, covariance))
-        return entries
+def smoothed_epochs(past: Iterable[RetiredEpoch], smoother: WindowSmoother) -> list[HistoryEntry]:
+    """The calibration of each epoch given all of them: those that have left the window, then its own."""
+    epochs = [*past, *smoother.live_epochs()]
+    walks = [smoother.walk(max(1e-3, (b.start_ns - a.start_ns) * 1e-9)) for a, b in pairwise(epochs)]
+    point = smoother.point.core()
+    beliefs = [_cluster_robust(epoch, point) for epoch in epochs]
+    forward = _messages(beliefs, walks, smoother.prior)
+    nothing = Gaussian(point, np.zeros((point.size, point.size)), np.zeros(point.size))
+    backward = _messages(beliefs[::-1], walks[::-1], nothing)[::-1]
+    entries = []
+    for epoch, belief, a, b in zip(epochs, beliefs, forward, backward, strict=True):
+        total = belief.plus(a).plus(b)
+        best = total.mean()
+        covariance = scaled_inverse(total.information)[:7, :7]
+        entries.append(HistoryEntry(epoch.start_ns, best.cTl, best.time_offset_s, covariance))
+    return entries
 
 
 def _messages(beliefs: Sequence[Gaussian], walks: Sequence[FloatArray], first: Gaussian) -> list[Gaussian]:

@@ -11,11 +11,11 @@ import numpy as np
 from sst_graph.drive.geometric_labels import labelled_by_geometry
 from sst_graph.drive.preparation import TRACK_INTERVAL_S, image_features, scan_features
 from sst_graph.drive.stamp_intervals import Jump, StampMonitor
+from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.lidar import LidarOdometry
 from sst_graph.odometry.visual import ImagePair, next_pair
-from sst_graph.tracker.admission import StampOrder, check_lateness
 from sst_graph.tracker.by_edges.kinds import by_edges
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.estimate import OnlineEstimate
@@ -26,6 +26,12 @@ from sst_graph.validation import checked_image, checked_scan
 
 _Data = TypeVar("_Data", Scan, CameraImage)
 
+_CLOSEST_NS = 1_000_000
+"""Scans that are nearer to each other are one; no LiDAR turns a thousand times a second [ns]."""
+_FARTHEST_NS = 86_400 * 10**9
+"""A stamp that is farther ahead of the one before is an error, not a pause: a day [ns]."""
+_ELSEWHERE = 5
+"""Stamps in a row, rising but far from those before, that show that the clock was set."""
 _MAX_IMAGES = 600
 """Most images that are kept, for any number of them may come while no scan does: a minute at 10 Hz."""
 _MAX_EDGE_IMAGES = 100
@@ -34,6 +40,57 @@ _MAX_FAILURES = 10
 """Failures in a row after which the window is given up: it is then their likely cause."""
 _SEARCH_MARGIN_S = 1.0
 """Images farther from a scan are kept, too, until the time offset is known [s]."""
+
+
+class StampOrder:
+    """Whether a sensor's stamps go on from those before.
+
+    A single stamp that is out of order, or a day ahead, is refused; several in a row mean that the clock was
+    set, else every later frame would be refused.
+
+    Attributes:
+        newest_ns: latest stamp that was used; None before the first.
+    """
+
+    def __init__(self, sensor: str, may_be_late: bool) -> None:
+        """may_be_late: stamps before the newest are allowed."""
+        self.sensor, self.may_be_late = sensor, may_be_late
+        self.newest_ns: int | None = None
+        self._elsewhere: deque[int] = deque(maxlen=_ELSEWHERE)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the stamps that were refused."""
+        return {**vars(self), "_elsewhere": deque(maxlen=_ELSEWHERE)}
+
+    def check(self, stamp_ns: int) -> int:
+        """Whether a stamp may be used; nothing but a refusal is remembered.
+
+        Returns:
+            0, or by how much the clock was set [ns].
+
+        Raises:
+            DataError: it is out of place; those after it may show that the clock was set.
+        """
+        newest, elsewhere = self.newest_ns, self._elsewhere
+        if newest is None or self._follows(stamp_ns, newest):
+            return 0
+        if elsewhere and not self._follows(stamp_ns, elsewhere[-1]):
+            elsewhere.clear()
+        elsewhere.append(stamp_ns)
+        if len(elsewhere) < _ELSEWHERE:
+            found = f"a stamp of {stamp_ns} ns"
+            raise DataError(self.sensor, found, f"one after {newest} ns, by a day at most")
+        return stamp_ns - newest
+
+    def add(self, stamp_ns: int, restarted: bool) -> None:
+        """A stamp was used; ``restarted``: the stamps go on from there."""
+        newest = self.newest_ns
+        self.newest_ns = stamp_ns if restarted or newest is None else max(newest, stamp_ns)
+        self._elsewhere.clear()
+
+    def _follows(self, stamp_ns: int, before_ns: int) -> bool:
+        step = stamp_ns - before_ns
+        return step <= _FARTHEST_NS and (self.may_be_late or step >= _CLOSEST_NS)
 
 
 def _with_own_arrays(data: _Data) -> _Data:
@@ -110,7 +167,7 @@ class SensorInputs:
         """
         if clock_step_ns:
             self.window.forget_images_before(self.window.next_image)
-        check_lateness(image, self.window, estimate.point.time_offset_s, self.config.late_s)
+        self._check_lateness(image, estimate.point.time_offset_s)
         self.image_order.add(image.stamp_ns, clock_step_ns != 0)
         self.stamps.add_image(image.stamp_ns, self.window.place)
         calibration = self.config.calibration
@@ -145,6 +202,16 @@ class SensorInputs:
         self.failures.clear()
         alarm = self.config.alarm
         return jump if alarm.enabled and alarm.stamps else None
+
+    def _check_lateness(self, image: CameraImage, time_offset_s: float) -> None:
+        """Refuse an image that is far behind the newest scan in true time."""
+        newest, images = self.window.last_stamp_ns, self.window.images
+        if newest is None or not images:
+            return
+        late_s = (newest - image.stamp_ns) * 1e-9 - time_offset_s
+        if late_s > self.config.late_s and image.stamp_ns < images[-1].stamp_ns:
+            found = f"one {late_s:.2f} s behind the newest scan"
+            raise DataError("image", found, f"at most {self.config.late_s:g} s")
 
     def _image_motion(self, image: CameraImage, estimate: OnlineEstimate) -> ImagePair | None:
         """What an image shows of the camera's motion: a start by edges needs it, nothing else does."""

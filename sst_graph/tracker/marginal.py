@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.marginal import CalibrationMarginal, inverse
+from sst_graph.marginal import CalibrationMarginal
 
 FloatArray = NDArray[np.float64]
 
@@ -23,18 +23,6 @@ class TrackedMarginal(CalibrationMarginal):
     """
 
     start: int = 0
-
-
-def tracked_marginal(
-    cTl: gtsam.Pose3, time_offset_s: float, covariance: FloatArray, start: int
-) -> TrackedMarginal:
-    """An estimate and its covariance (7, 7), about itself.
-
-    Raises:
-        EstimationError: the covariance has no inverse.
-    """
-    information = inverse(covariance, "covariance of the tracker")
-    return TrackedMarginal(cTl, time_offset_s, information, np.zeros(7), start=start)
 
 
 def moved_to(whole: TrackedMarginal, previous: CalibrationMarginal) -> TrackedMarginal:

@@ -12,8 +12,7 @@ from sst_graph.config import to_dict
 from sst_graph.factors.arguments import checked_type
 from sst_graph.inspect.gained import KEY, to_document
 from sst_graph.result import CalibrationResult, FrameId, Status
-from sst_graph.tracker.make_update import current_update
-from sst_graph.tracker.track_update import TrackUpdate
+from sst_graph.tracker.track_update import TrackUpdate, current_update
 
 if TYPE_CHECKING:
     from sst_graph.tracker.monitor.change_detector import ChangeDetector
@@ -67,7 +66,7 @@ def tracker_result(tracker: Tracker, drive: str, camera_name: str) -> Calibratio
                 c.name.lower(): bias
                 for (_, c), bias in estimate.point.state(config.calibration.classes).biases_px.items()
             },
-            "assumptions": assumption_report(estimate.considered(), estimate.tests.findings),
+            "assumptions": assumption_report(estimate.considered(), estimate.findings),
             "estimated": last.to_dict()["estimated"],
             "error_model": None
             if model is None

@@ -14,16 +14,15 @@ from sst_graph.drive.stamp_intervals import Jump
 from sst_graph.errors import DataError, EstimationError
 from sst_graph.factors.arguments import checked_count, checked_type
 from sst_graph.factors.camera import PinholeCamera
+from sst_graph.marginal import inverse
 from sst_graph.odometry.sweep import SweepDecision
 from sst_graph.result import UNNAMED_CAMERA, CalibrationResult
 from sst_graph.timestamps import LATEST_NS
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.estimate import FrameMatches, OnlineEstimate
 from sst_graph.tracker.inputs import SensorInputs
-from sst_graph.tracker.make_update import current_update, make_update
-from sst_graph.tracker.marginal import TrackedMarginal, increment, tracked_marginal
+from sst_graph.tracker.marginal import TrackedMarginal, increment
 from sst_graph.tracker.monitor.monitor import Monitor
-from sst_graph.tracker.monitor.statistic import ComparedEstimate
 from sst_graph.tracker.result import tracker_result
 from sst_graph.tracker.spread_work import NUMERICAL_ERRORS
 from sst_graph.tracker.start.first_estimate import StartGuess
@@ -36,7 +35,7 @@ from sst_graph.tracker.start.initializer import (
 from sst_graph.tracker.storage.checkpoint import Saver, load_checkpoint
 from sst_graph.tracker.storage.resume import Setup
 from sst_graph.tracker.storage.snapshot import Snapshot
-from sst_graph.tracker.track_update import Sensor, TrackUpdate
+from sst_graph.tracker.track_update import Sensor, TrackUpdate, current_update, make_update
 from sst_graph.tracker.window.matcher import WindowMatcher
 from sst_graph.types import CameraImage, Frame, Scan
 from sst_graph.validation import checked_frame, checked_guess, checked_intrinsics
@@ -144,7 +143,6 @@ class Tracker:
                     return self._restart(change, checked.stamp_ns)
                 # 7. Add the matches to the graph, and estimate.
                 self.estimate.update(matches)
-                self.monitor.changes.statistic.variance_ratio = self.estimate.variance_ratio
                 # 8. Check the start against later frames; adopt the estimate where held-out frames agree.
                 return self._review(matches, checked.stamp_ns, chi2)
         except Exception as error:
@@ -167,7 +165,6 @@ class Tracker:
         checked_count("max_iterations", max_iterations)
         at_end = not self.estimate.exists and self._finish_start()
         converged = self.estimate.optimize(max_iterations)
-        self.monitor.changes.statistic.variance_ratio = self.estimate.variance_ratio
         if converged is not None and (at_end or self.estimate.edges is not None):
             self.monitor.check_start_at_end(self.estimate)
         return dataclasses.replace(current_update(self, self.last_update), converged=converged)
@@ -200,7 +197,8 @@ class Tracker:
         if not self.estimate.exists:
             raise EstimationError("the tracker has no estimate yet: no marginal")
         point, starts = self.estimate.point, self.estimate.starts
-        whole = tracked_marginal(point.cTl, point.time_offset_s, self.estimate.reported_covariance(), starts)
+        information = inverse(self.estimate.reported_covariance(), "covariance of the tracker")
+        whole = TrackedMarginal(point.cTl, point.time_offset_s, information, np.zeros(7), start=starts)
         if since is None:
             return whole
         if since.start != whole.start:
@@ -282,12 +280,9 @@ class Tracker:
 
     def _begin(self, initialization: Initialization, stamp_ns: int) -> TrackUpdate:
         """Go on from a first estimate, if the frames that it is made of agree with it."""
-        smoother, window = initialization.smoother, self.inputs.window
-        estimate = ComparedEstimate(smoother.point, initialization.uncertainty.joint, smoother.model)
-        self.monitor.changes.statistic.variance_ratio = initialization.variance_ratio
-        why = ""
+        window, why = self.inputs.window, ""
         if initialization.first.reviewed:
-            why = self.monitor.changes.check_start(list(smoother.entries), estimate)
+            why = self.monitor.changes.check_start(initialization.for_comparison())
         if why:
             return self._restart(Restart(self.initializer.guess, len(window.scans) // 2, why), stamp_ns)
         self.estimate.begin(initialization)
@@ -331,7 +326,7 @@ class Tracker:
 
     def _review(self, matches: FrameMatches, stamp_ns: int, chi2: float | None) -> TrackUpdate:
         """The update for a scan that has been used; the estimate is adopted where held-out frames agree."""
-        self.monitor.recheck_start(matches.scan, self.estimate)
+        self.monitor.changes.recheck_start(matches.scan, self.estimate.for_comparison())
         reason = "" if matches.new else "no match: no scan met an image that shows the same objects"
         update = make_update(self, stamp_ns, reason, chi2=chi2)
         trusted = update.status == "ok" and not update.suspected_change

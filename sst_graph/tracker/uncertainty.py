@@ -13,7 +13,7 @@ from sst_graph.batch.method_estimate import UNKNOWN_SIGMAS
 from sst_graph.covariance.considered import steps_by
 from sst_graph.errors import EstimationError
 from sst_graph.graph.linear import scaled_inverse
-from sst_graph.tracker.monitor.statistic import EstimateCovariance
+from sst_graph.tracker.monitor.statistic import ComparedEstimate, EstimateCovariance
 from sst_graph.tracker.sums.held import EDGE_ERRORS, SHIFTS
 from sst_graph.tracker.window.smoother import WindowSmoother
 
@@ -73,6 +73,11 @@ class Uncertainty:
         share = np.array([-held[name] for name in SHIFTS if name in held]).reshape(-1, 7).T
         joint = EstimateCovariance(matrix, smoother.past.point.tracks, m)
         return cls(joint, inflation, by_static_objects, steps, positions, share)
+
+    def compared(self, smoother: WindowSmoother, variance_ratio: float) -> ComparedEstimate:
+        """A smoother's estimate with this covariance, for the comparison of frames with it."""
+        scans = tuple(smoother.entries)
+        return ComparedEstimate(smoother.point, self.joint, smoother.model, scans, variance_ratio)
 
     @property
     def covariance(self) -> FloatArray:

@@ -20,7 +20,7 @@ from sst_graph.cameras.readers import (
     cameras_from_kalibr,
     kitti_rectifying_rotation,
 )
-from sst_graph.cameras.tables import parse_kitti_raw, read_kitti_raw
+from sst_graph.data.kitti.raw_calib import parse_kitti_raw, read_kitti_raw
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.files.yaml_file import parse_yaml, read_yaml

@@ -12,7 +12,7 @@ import pytest
 
 from checks.fuzz_layouts import HEADERS, npy_of
 from sst_graph.data.point_files import read_cloud
-from sst_graph.data.point_files.lzf import unpack_lzf
+from sst_graph.data.point_files.pcd import unpack_lzf
 from sst_graph.errors import DataError
 
 DTYPE = np.dtype(

@@ -18,7 +18,7 @@ import pytest
 from sst_graph.errors import ConfigError
 from sst_graph.files import (
     MANIFEST,
-    FileKind,
+    OutputFileKind,
     OutputKind,
     atomic_directory,
     atomic_write_bytes,
@@ -373,7 +373,7 @@ def test_a_living_temporary_is_left_alone(tmp_path: Path) -> None:
 
 
 def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
-    kind = FileKind("a song", lambda head: head.startswith(b"la"))
+    kind = OutputFileKind("a song", lambda head: head.startswith(b"la"))
     (tmp_path / "a").write_text("thesis")
     with pytest.raises(ConfigError, match="found a file, expected none"):
         check_file_target(tmp_path / "a", False, kind)

@@ -17,7 +17,7 @@ import pytest
 
 from sst_graph.errors import ConfigError
 from sst_graph.fleet.attempt import Job
-from sst_graph.fleet.dask_pool import Cluster, run_on_dask
+from sst_graph.fleet.dask_pool import run_on_dask
 from sst_graph.fleet.drives import Drive
 from sst_graph.fleet.local_pool import run_locally
 from sst_graph.fleet.places import Place
@@ -67,7 +67,7 @@ def test_dask_repeats_what_a_lost_worker_had(tmp_path: Path) -> None:
     import dask
 
     with dask.config.set({"distributed.scheduler.allowed-failures": 1}):
-        found = {one.drive: one for one in run_on_dask(jobs(8, tmp_path), Cluster("local", 2), deadly) if one}
+        found = {one.drive: one for one in run_on_dask(jobs(8, tmp_path), "local", 2, deadly) if one}
     assert sorted(found) == [job.drive.name for job in jobs(8)]
     assert [one.status for name, one in found.items() if name != "drive_0005"] == ["ok"] * 7
     assert found["drive_0005"].status == "killed" and "Dask workers were lost" in found["drive_0005"].reason
@@ -91,7 +91,7 @@ def test_a_result_that_is_lost_with_its_worker_is_made_again(tmp_path: Path) -> 
     import dask
 
     with dask.config.set({"distributed.scheduler.allowed-failures": 1}):
-        found = [one for one in run_on_dask(jobs(12, tmp_path), Cluster("local", 2), dying) if one]
+        found = [one for one in run_on_dask(jobs(12, tmp_path), "local", 2, dying) if one]
     assert sorted(one.drive for one in found) == [job.drive.name for job in jobs(12)]
     assert {one.status for one in found} <= {"ok", "killed"}
     assert sum(one.status == "ok" for one in found) >= 6
@@ -104,7 +104,7 @@ def test_workers_that_are_killed_while_they_start_are_replaced() -> None:
     psutil = pytest.importorskip("psutil")
     until = time.monotonic() + 15.0
     killed, done = set(), []
-    for one in run_on_dask(jobs(20), Cluster("local", 2), lingering):
+    for one in run_on_dask(jobs(20), "local", 2, lingering):
         done += [one] if one else []
         if time.monotonic() < until:
             for process in psutil.Process().children(recursive=True):
@@ -129,7 +129,7 @@ def broken(job: Job) -> Record:
 @pytest.mark.slow
 def test_a_worker_that_cannot_run_a_drive_is_no_lost_worker() -> None:
     pytest.importorskip("distributed")
-    found = [one for one in run_on_dask(jobs(2), Cluster("local", 1), broken) if one]
+    found = [one for one in run_on_dask(jobs(2), "local", 1, broken) if one]
     assert [one.status for one in found] == ["crash", "crash"]
     assert "could not be run on its Dask worker: No module named 'sst_graph'" in found[0].reason
 
@@ -149,7 +149,7 @@ def test_a_lost_scheduler_is_a_sentence(tmp_path: Path) -> None:
     (tmp_path / "pid").write_text(str(scheduler.pid))
     try:
         with pytest.raises(ConfigError, match="lost the scheduler"):
-            list(run_on_dask(jobs(3, tmp_path), Cluster(address, 1), fatal))
+            list(run_on_dask(jobs(3, tmp_path), address, 1, fatal))
     finally:
         for one in (worker, scheduler):
             one.kill()
@@ -171,4 +171,4 @@ def test_no_scheduler(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
     monkeypatch.setattr("sst_graph.fleet.dask_pool._CONNECT_S", 0.5)
     with pytest.raises(ConfigError, match="found no scheduler"):
-        list(run_on_dask(jobs(1), Cluster("tcp://127.0.0.1:1", 1), instant))
+        list(run_on_dask(jobs(1), "tcp://127.0.0.1:1", 1, instant))

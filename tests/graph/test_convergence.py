@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sst_graph.graph.convergence import FULL_STEPS, step_share
+from sst_graph.graph.outer_loop import FULL_STEPS, step_share
 
 
 def test_whole_steps_then_ever_smaller_ones() -> None:

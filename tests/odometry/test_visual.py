@@ -14,9 +14,8 @@ from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.odometry.depth import InverseDepths, inverse_depths
 from sst_graph.odometry.features import FeatureTracker, Tracks, detect_corners
-from sst_graph.odometry.metric import TrackErrors, metric_motion, motion_from_depths
+from sst_graph.odometry.metric import TrackErrors, consensus_translation, metric_motion, motion_from_depths
 from sst_graph.odometry.relative import rays, relative_pose
-from sst_graph.odometry.starts import consensus_translation
 from sst_graph.odometry.visual import image_pairs, metric_motions
 from sst_graph.types import CameraImage, SemanticClass
 

@@ -28,8 +28,8 @@ from sst_graph.graph.matching import Tracks
 from sst_graph.graph.outer_loop import JointProblem, solve_joint
 from sst_graph.graph.state import State, nuisance_key
 from sst_graph.objects.tracks import object_tracks
-from sst_graph.tracker.make_update import current_update
 from sst_graph.tracker.sums.running_sums import RunningSums
+from sst_graph.tracker.track_update import current_update
 from sst_graph.tracker.window.gaussian import Gaussian, Point
 from sst_graph.tracker.window.window import Window
 
@@ -113,7 +113,7 @@ def test_what_the_tracker_considers_is_what_the_batch_does(optimized: Tracker) -
     plain = considered_by_matches(
         robust, pairs, values, state, optimized.setup.config.calibration.assumptions
     )
-    expected = with_test_results(plain, optimized.estimate.tests.findings)
+    expected = with_test_results(plain, optimized.estimate.findings)
     found = optimized.estimate.considered()
     assert dict(found.sigmas) == dict(expected.sigmas) and set(found.sigmas) == set(ASSUMPTIONS)
     scale = np.sqrt(np.diag(optimized.estimate.covariance)[:7])
@@ -224,11 +224,11 @@ def test_a_wrong_principal_point_is_named(street: KeptDrive) -> None:
     assert update.to_dict()["contradictions"] == list(update.contradictions)
     result = tracker.result()
     assert result.status == "not_converged" and result.reasons[0] == update.contradictions[0]
-    found = tracker.estimate.tests.findings[0]
+    found = tracker.estimate.findings[0]
     assert found.contradicted and found.score > 1.0
     assert 10.0 < found.value < 30.0  # one step from where matches are near
     # Not tested: nothing is found, and no more is considered than beforehand.
-    tracker.estimate.tests.restart()
+    tracker.estimate.findings = ()
     assert current_update(tracker).contradictions == () and current_update(tracker).status != "contradicted"
     assert tracker.estimate.considered().sigmas["cx"] == ASSUMPTIONS["cx"].sigma
     assert np.all(current_update(tracker).sigmas < update.sigmas)

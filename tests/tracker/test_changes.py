@@ -25,8 +25,7 @@ from sst_graph.covariance.observability import ObservabilityConfig
 from sst_graph.simulator import SimulatedDrive
 from sst_graph.tracker.config import AlarmConfig, DriftConfig, TrackerConfig
 from sst_graph.tracker.history import HistoryEntry
-from sst_graph.tracker.make_update import current_update
-from sst_graph.tracker.track_update import TrackUpdate
+from sst_graph.tracker.track_update import TrackUpdate, current_update
 from sst_graph.types import Frame, SemanticClass
 
 STEP = 20

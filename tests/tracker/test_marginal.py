@@ -13,8 +13,8 @@ from sst_graph import Tracker
 from sst_graph.errors import EstimationError
 from sst_graph.export import EXTRINSIC, TIME_OFFSET, fuse_marginals
 from sst_graph.simulator import SimulatedDrive
-from sst_graph.tracker.make_update import current_update
 from sst_graph.tracker.marginal import TrackedMarginal, increment, moved_to
+from sst_graph.tracker.track_update import current_update
 from sst_graph.types import Frame
 
 SHORT = dataclasses.replace(EARLY_START, window=10)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from sst_graph.covariance.error_model import ErrorModel, SideResiduals, fit_error_model
 from sst_graph.covariance.sums import ScoreSums
 from sst_graph.tracker.config import AlarmConfig, TrackerConfig
-from sst_graph.tracker.monitor.adoption import Adoption
 from sst_graph.tracker.monitor.confirmation import Confirmation, steps
+from sst_graph.tracker.monitor.monitor import Adoption
 from sst_graph.tracker.monitor.statistic import ChangeStatistic, ComparedEstimate, EstimateCovariance
 from sst_graph.tracker.sums.linearized_pair import LinearizedPair
 from sst_graph.tracker.sums.running_sums import RunningSums
@@ -248,17 +248,17 @@ def test_a_new_object_is_as_uncertain_as_its_class_and_more() -> None:
 def test_a_worse_candidate_is_refused() -> None:
     """A covariance within the limits, and held-out costs that are no worse, over enough frames."""
     good, bad = _gaussian(1).point, _gaussian(2).point
-    adoption = Adoption(frames=5, margin=0.02)
-    for _ in range(4):
+    adoption = Adoption()
+    for _ in range(9):
         adoption.compare(1.0, 2.0)
     assert not adoption.propose(good, trusted=True)  # too few frames
     adoption.compare(1.0, 2.0)
     assert not adoption.propose(good, trusted=False)  # a covariance past the limits
     assert adoption.propose(good, trusted=True) and adoption.adopted is good
     adoption.restart()
-    for _ in range(5):
+    for _ in range(10):
         adoption.compare(1.1, 1.0)  # a confident candidate that explains held-out frames worse
     assert not adoption.propose(bad, trusted=True) and adoption.adopted is good
-    for _ in range(5):
+    for _ in range(10):
         adoption.compare(1.01, 1.0)
     assert adoption.propose(bad, trusted=True) and adoption.adopted is bad

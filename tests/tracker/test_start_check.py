@@ -11,8 +11,7 @@ from streets import knocked, tracker_from_truth
 
 from sst_graph import Tracker
 from sst_graph.simulator import SimulatedDrive
-from sst_graph.tracker.make_update import current_update
-from sst_graph.tracker.track_update import TrackUpdate
+from sst_graph.tracker.track_update import TrackUpdate, current_update
 from sst_graph.tracker.uncertainty import Uncertainty
 from sst_graph.types import Frame
 

@@ -20,7 +20,7 @@ from sst_graph.inspect.gained import gained_of
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.result import CalibrationResult
 from sst_graph.simulator import SimulatedDrive
-from sst_graph.tracker.make_update import current_update
+from sst_graph.tracker.track_update import current_update
 from sst_graph.tracker.window.epochs import MatchedPair
 from sst_graph.types import Frame
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sst_graph.drive.preparation import Drive, ImageFeatures, ScanFeatures
+from sst_graph.drive.preparation import Drive, ScanFeatures
 from sst_graph.types import SemanticClass
 
 
@@ -42,13 +42,14 @@ def labelled_stamps(drive: Drive) -> tuple[frozenset[int], frozenset[int]]:
 
 def _of_kind(drive: Drive, by_edges: bool) -> Drive:
     """The drive with the objects without a class alone, or without them."""
-    scans = tuple(_by_edges(scan) if by_edges else _by_labels(scan) for scan in drive.scans)
-    images = tuple(_image_of(image, by_edges) for image in drive.images)
+    scans = tuple((scan.by_geometry or scan) if by_edges else _by_labels(scan) for scan in drive.scans)
+    images = tuple(
+        image.with_contours(
+            {c: m for c, m in image.contours.items() if (c == SemanticClass.OBJECT) == by_edges}
+        )
+        for image in drive.images
+    )
     return replace(drive, scans=scans, images=images)
-
-
-def _by_edges(scan: ScanFeatures) -> ScanFeatures:
-    return scan if scan.by_geometry is None else scan.by_geometry
 
 
 def _by_labels(scan: ScanFeatures) -> ScanFeatures:
@@ -64,8 +65,3 @@ def _by_labels(scan: ScanFeatures) -> ScanFeatures:
         of_objects = np.full(len(points), SemanticClass.OBJECT, np.uint8)
         kept["classes"] = np.concatenate([scan.classes, of_objects])
     return ScanFeatures(**kept)
-
-
-def _image_of(image: ImageFeatures, by_edges: bool) -> ImageFeatures:
-    kept = {c: each for c, each in image.contours.items() if (c == SemanticClass.OBJECT) == by_edges}
-    return image.with_contours(kept)

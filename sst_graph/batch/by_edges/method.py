@@ -8,9 +8,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sst_graph.batch.by_edges.covariance import edges_covariance
-from sst_graph.batch.by_edges.fit import fit_of_edges
 from sst_graph.batch.by_edges.halves import halves_reasons
 from sst_graph.batch.by_edges.lens import lens_steps
 from sst_graph.batch.by_edges.optimum import RESTARTS, best_optimum_steps, refined_steps, starts_steps
@@ -22,11 +22,15 @@ from sst_graph.batch.method_estimate import MethodEstimate, frames_used
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate, MatchedDrives
 from sst_graph.batch.total_covariance import sweep_effects
 from sst_graph.drive.preparation import Drive, Progress
+from sst_graph.fit import Fit, Profile
 from sst_graph.graph.outer_loop import JointSolution, solve_joint
 from sst_graph.graph.state import difference
 from sst_graph.hand_eye.solution import MotionSolution
+from sst_graph.quality.profiles import score_profiles
 from sst_graph.stepwise import run_to_end
 from sst_graph.types import Guess
+
+FloatArray = NDArray[np.float64]
 
 
 def edges_method(
@@ -117,3 +121,22 @@ def _diagnostics(
             "sigmas": sigmas.tolist(),
         }
     return facts
+
+
+def fit_of_edges(
+    calibration: CalibrationProblem, solutions: Sequence[JointSolution], covariance: FloatArray
+) -> Fit | None:
+    """How the last of the solutions, each of which led to the next, fits the pictures.
+
+    Args:
+        calibration: with the points that the last solution matched.
+        covariance: (7, 7) of the result.
+    """
+    solution = solutions[-1]
+    iterations = [each for one in solutions for each in one.iterations]
+    profiles: Sequence[Profile] = ()
+    if calibration.config.for_report:
+        edges = calibration.fit_of_drives.edges
+        frozen = solution.frozen.linearized(solution.optimum).covariance()[:7, :7]
+        profiles = score_profiles(edges, solution.state, frozen, np.sqrt(np.diag(covariance)))
+    return calibration.fit_at(solution.state, iterations, profiles)

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from sst_graph.drive.preparation import Progress
-from sst_graph.graph.convergence import STEP_SIGMAS
-from sst_graph.graph.outer_loop import JointProblem, JointSolution, solve_joint_steps
+from sst_graph.graph.outer_loop import STEP_SIGMAS, JointProblem, JointSolution, solve_joint_steps
 from sst_graph.graph.state import State
 from sst_graph.stepwise import Stepwise
 

@@ -1,7 +1,8 @@
 """The options of every command. Imports nothing heavy: ``--help`` answers at once.
 
-What several commands take, by what it is about: ``data``, ``labels``, ``method``, ``rig``. The commands with
-what each alone takes: ``calibration``, ``simulation``, ``drives``, ``results``, ``formats``, ``program``.
+What several commands take, by what it is about: ``data``, ``method``. The commands with what each alone
+takes: ``calibration``, ``simulation``, ``drives``, ``results``, ``formats``; those on the program itself are
+in ``parser``.
 """
 
 from __future__ import annotations

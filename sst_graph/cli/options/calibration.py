@@ -5,11 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from sst_graph.cli.options.base_parser import SIGN, Commands, Renamed
-from sst_graph.cli.options.data import add_source_options
-from sst_graph.cli.options.labels import add_label_options
+from sst_graph.cli.options.base_parser import SIGN, Commands, Parser, Renamed
+from sst_graph.cli.options.data import add_label_options, add_source_options
 from sst_graph.cli.options.method import add_estimate, add_method, add_settings
-from sst_graph.cli.options.rig import add_rig
 
 
 def add_calibrate(commands: Commands) -> argparse.ArgumentParser:
@@ -32,7 +30,7 @@ def add_calibrate(commands: Commands) -> argparse.ArgumentParser:
     calibrate.add_argument(
         "--delay-per-drive", action=Renamed, const="--time-offset-per-drive", help=argparse.SUPPRESS
     )
-    add_rig(calibrate)
+    _add_rig(calibrate)
     calibrate.add_argument(
         "--out",
         type=Path,
@@ -50,6 +48,25 @@ def add_calibrate(commands: Commands) -> argparse.ArgumentParser:
         "--overwrite", action="store_true", help="replace an earlier result in DIR, and the video"
     )
     return calibrate
+
+
+def _add_rig(command: Parser) -> None:
+    """What is known of several cameras."""
+    rig = command.add_argument_group("several cameras (docs/how-to/rigs.md)")
+    rig.add_argument(
+        "--rig",
+        metavar="dataset|FILE",
+        help="known poses between the cameras: those of the data's nominal calibration, or of Kalibr's "
+        "camchain.yaml (T_cn_cnm1) or KITTI's calib.txt",
+    )
+    rig.add_argument(
+        "--rig-sigma",
+        metavar="DEG,CM",
+        help="how well these are known, one sigma along each axis (default 0.03,0.2)",
+    )
+    rig.add_argument(
+        "--one-trigger", action="store_true", help="all cameras are triggered together: one time offset"
+    )
 
 
 def add_batch(commands: Commands) -> argparse.ArgumentParser:

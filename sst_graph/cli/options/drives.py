@@ -6,8 +6,7 @@ import argparse
 from pathlib import Path
 
 from sst_graph.cli.options.base_parser import Commands
-from sst_graph.cli.options.data import add_source_options
-from sst_graph.cli.options.labels import add_label_options, add_networks
+from sst_graph.cli.options.data import add_label_options, add_networks, add_source_options
 
 
 def add_info(commands: Commands) -> argparse.ArgumentParser:

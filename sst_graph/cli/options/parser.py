@@ -5,13 +5,40 @@ from __future__ import annotations
 import argparse
 
 import sst_graph
-from sst_graph.cli.options.base_parser import Parser
+from sst_graph.cli.options.base_parser import Commands, Parser
 from sst_graph.cli.options.calibration import add_batch, add_calibrate, add_track
 from sst_graph.cli.options.drives import add_info, add_segment
 from sst_graph.cli.options.formats import add_export, add_import
-from sst_graph.cli.options.program import add_completion, add_settings_command
 from sst_graph.cli.options.results import add_evaluate, add_inspect, add_overlay, add_view
 from sst_graph.cli.options.simulation import add_demo, add_experiment, add_simulate
+
+
+def add_settings_command(commands: Commands) -> argparse.ArgumentParser:
+    text = "list the settings of calibrate and track: default, unit, range, and when to change them"
+    settings = commands.add_parser("settings", help=text, description=text)
+    settings.add_argument(
+        "name",
+        metavar="NAME",
+        nargs="?",
+        default="",
+        help="only those whose dotted name contains this, such as start or joint.graph",
+    )
+    form = settings.add_mutually_exclusive_group()
+    form.add_argument("--json", action="store_true", help="print JSON")
+    form.add_argument("--markdown", action="store_true", help="print Markdown (docs/reference/settings.md)")
+    return settings
+
+
+def add_completion(commands: Commands) -> argparse.ArgumentParser:
+    text = "print what completes commands and options in a shell"
+    completion = commands.add_parser(
+        "completion",
+        help=text,
+        description=f"{text[0].upper()}{text[1:]}: source <(sst-graph completion bash), or in zsh "
+        "sst-graph completion zsh > a folder of $fpath, as _sst-graph.",
+    )
+    completion.add_argument("shell", choices=("bash", "zsh", "tcsh"))
+    return completion
 
 
 def build_parser() -> argparse.ArgumentParser:

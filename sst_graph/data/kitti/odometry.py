@@ -14,16 +14,14 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import overload
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.classes import MaskEncoding
 from sst_graph.data.arrays import read_offsets, read_points
 from sst_graph.data.images import picture_size, read_instances
 from sst_graph.data.info.facts import SensorFacts, SourceFacts
@@ -41,11 +39,10 @@ from sst_graph.data.kitti.odometry_layout import (
 from sst_graph.data.kitti.truth import drive_truth
 from sst_graph.data.pictures import PictureFiles, mask_encoding, point_labels
 from sst_graph.data.scan_order import rings_from_order
-from sst_graph.data.source import TURNS, Loader, SourceOptions, Sweep
-from sst_graph.data.two_clocks import DriveProperties, Sensor, TwoClockSource, merged
+from sst_graph.data.source import TURNS, Loader, SourceOptions
+from sst_graph.data.two_clocks import DriveProperties, IndexedSource, Sensor, TwoClockSource, merged
 from sst_graph.errors import ConfigError, printable
-from sst_graph.factors.camera import PinholeCamera
-from sst_graph.sweep_timing import SweepStamp, SweepTiming
+from sst_graph.sweep_timing import SweepTiming
 from sst_graph.timestamps import read_times
 from sst_graph.types import CameraImage, Frame, GroundTruth, Scan, with_intensities
 
@@ -53,78 +50,24 @@ _LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
-class KittiDrive:
-    """What holds for every frame of a drive.
+class KittiSource(IndexedSource):
+    """A KITTI drive that satisfies :class:`~sst_graph.types.Source`; a slice of it is one as well.
+
+    Made by :func:`open_kitti`. ``indices`` are those of the scans.
 
     Attributes:
-        camera: intrinsics of the chosen camera.
-        nominal: cTl of ``calib.txt``, or None where it has no line Tr.
-        truth: from ``groundtruth.json``, or else the published calibration as a reference, if there is one.
-        truth_is_reference: the truth is the published calibration: itself good to a tenth of a
-            degree or so, not known to hold.
-        encoding: of the masks.
+        files: paths of the drive.
+        stamps_ns: (n,) stamps of times.txt [ns]; scan k and image k share the stamp k.
+        options: how the drive is read: frame k shows image k + ``options.image_shift``.
+        pictures: pictures and masks.
         timing: times of the points by azimuth, where the options name a sense of rotation.
     """
 
-    camera: PinholeCamera
-    nominal: gtsam.Pose3 | None
-    truth: GroundTruth | None
-    truth_is_reference: bool
-    encoding: MaskEncoding
-    timing: SweepTiming | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class KittiSource:
-    """A KITTI drive that satisfies :class:`~sst_graph.types.Source`; a slice of it is one as well.
-
-    Made by :func:`open_kitti`.
-
-    Attributes:
-        name: data set and sequence, "kitti/00".
-        drive: what holds for every frame.
-        files: paths of the drive.
-        stamps_ns: (n,) stamps of times.txt [ns]; scan k and image k share the stamp k.
-        indices: scan index of each frame.
-        options: how the drive is read: frame k shows image k + ``options.image_shift``.
-    """
-
-    name: str
-    drive: KittiDrive
     files: KittiFiles
     stamps_ns: NDArray[np.int64]
-    indices: tuple[int, ...]
     options: SourceOptions
-
-    @property
-    def camera(self) -> PinholeCamera:
-        return self.drive.camera
-
-    @property
-    def nominal(self) -> gtsam.Pose3 | None:
-        return self.drive.nominal
-
-    @property
-    def truth(self) -> GroundTruth | None:
-        return self.drive.truth
-
-    @property
-    def truth_is_reference(self) -> bool:
-        """Whether the truth is the published calibration, not known to hold."""
-        return self.drive.truth_is_reference
-
-    @property
-    def sweep(self) -> Sweep:
-        """How the times of the points are found."""
-        return self.options.sweep
-
-    @property
-    def sweep_stamp(self) -> SweepStamp:
-        """The instant that a scan's stamp names where times follow from azimuths."""
-        return self.options.sweep_stamp
-
-    def __len__(self) -> int:
-        return len(self.indices)
+    pictures: PictureFiles
+    timing: SweepTiming | None = None
 
     @overload
     def __getitem__(self, position: int) -> Frame: ...
@@ -144,13 +87,6 @@ class KittiSource:
         if image is not None:
             image = replace(image, instances=self._instances(index))
         return Frame(index, scan, image)
-
-    def __iter__(self) -> Iterator[Frame]:
-        return (self[position] for position in range(len(self)))
-
-    def frame_number(self, position: int) -> int:
-        """Scan index of the frame at a position; nothing is read."""
-        return self.indices[position]
 
     def read_scan(self, position: int) -> Scan | None:
         """Scan of the frame at a position; errors as of the frame."""
@@ -202,8 +138,8 @@ class KittiSource:
     def _offsets(
         self, index: int, points: NDArray[np.float32], used: NDArray[np.bool_]
     ) -> NDArray[np.float32] | None:
-        if self.drive.timing is not None:
-            return self.drive.timing.offsets_s(points)
+        if self.timing is not None:
+            return self.timing.offsets_s(points)
         if self.sweep == "auto" and self.files.point_times is not None:
             return read_offsets(self.files.point_times[index], used)
         return None
@@ -213,12 +149,6 @@ class KittiSource:
         if number not in self.files.image_numbers:
             return None
         return self.pictures.image(number, int(self.stamps_ns[index]))
-
-    @property
-    def pictures(self) -> PictureFiles:
-        """Pictures and masks."""
-        size = self.camera.width, self.camera.height
-        return PictureFiles(size, self.files.images, self.files.masks, self.drive.encoding)
 
     def _instances(self, index: int) -> NDArray[np.uint16] | None:
         path = self.files.instances.get(index + self.options.image_shift)
@@ -247,22 +177,21 @@ def open_kitti(path: Path, options: SourceOptions) -> KittiSource | TwoClockSour
     if missing := files.missing():
         _LOG.info("%s: %s", printable(folder), missing)
     truth, is_reference = drive_truth(folder, calibration, options.camera)
-    drive = KittiDrive(
-        camera=calibration.camera(options.camera, *size),
-        nominal=nominal,
-        truth=truth,
-        truth_is_reference=is_reference,
-        encoding=mask_encoding(files.masks, options.label_encoding, size),
-        timing=_timing(options, stamps_ns),
-    )
+    camera = calibration.camera(options.camera, *size)
+    sweep = options.sweep, options.sweep_stamp
+    properties = DriveProperties(_name(folder), camera, nominal, truth, is_reference, *sweep)
+    encoding = mask_encoding(files.masks, options.label_encoding, size)
+    pictures = PictureFiles(size, files.images, files.masks, encoding)
+    timing = _timing(options, stamps_ns)
     if image_stamps_ns is not None:
-        source = KittiSource(_name(folder), drive, files, stamps_ns, (), replace(options, image_shift=0))
+        unshifted = replace(options, image_shift=0)
+        source = KittiSource(properties, (), files, stamps_ns, unshifted, pictures, timing)
         return _with_image_stamps(source, image_stamps_ns, options, folder)
     indices = _select(files, options, len(stamps_ns))
     shift = options.image_shift
     pairs = [k for k in indices if k in files.scans and k + shift in files.image_numbers]
-    drive = replace(drive, truth=_shifted(truth, stamps_ns, pairs, shift))
-    return KittiSource(_name(folder), drive, files, stamps_ns, indices, options)
+    properties = replace(properties, truth=_shifted(truth, stamps_ns, pairs, shift))
+    return KittiSource(properties, indices, files, stamps_ns, options, pictures, timing)
 
 
 def _with_image_stamps(
@@ -278,12 +207,8 @@ def _with_image_stamps(
     def image(k: int) -> CameraImage:
         return pictures.image(int(images[k]), int(image_stamps_ns[images[k]]))
 
-    drive = source.drive
-    properties = DriveProperties(
-        source.name, drive.camera, drive.nominal, drive.truth, drive.truth_is_reference
-    )
     of_scans, of_images = Sensor(source.stamps_ns[scans], scan), Sensor(image_stamps_ns[images], image)
-    return merged(properties, of_scans, of_images, options, folder)
+    return merged(source.properties, of_scans, of_images, options, folder)
 
 
 def _timing(options: SourceOptions, stamps_ns: NDArray[np.int64]) -> SweepTiming | None:

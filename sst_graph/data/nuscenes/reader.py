@@ -132,7 +132,8 @@ def open_nuscenes(path: Path, options: SourceOptions) -> Source:
         raise ConfigError(f"{path}: tables {named}: keep one of them in the folder")
     tables = versions[0]
     scene = _scene(tables, options.sequence)
-    stored = _channels(tables, scene, _camera_name(options.camera))
+    named = _CAMERA if options.camera == SourceOptions().camera else options.camera
+    stored = _channels(tables, scene, named)
     lidar, camera = (_present(path, tables, channel) for channel in stored)
     model, nominal = _rig(tables, lidar, camera)
     size = (model.width, model.height)
@@ -158,10 +159,6 @@ def open_nuscenes(path: Path, options: SourceOptions) -> Source:
 def _versions(path: Path) -> list[Path]:
     entries = listed(path, LAYOUT)
     return [p for p in entries if p.name.startswith("v1.0-") and os.path.isfile(p / "sample_data.json")]
-
-
-def _camera_name(camera: str) -> str:
-    return _CAMERA if camera == SourceOptions().camera else camera
 
 
 def _scene(tables: Path, name: str | None) -> Record:

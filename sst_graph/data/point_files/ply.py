@@ -19,8 +19,8 @@ from sst_graph.data.point_files.cloud import (
     check_count,
     cloud_of,
     structured_fields,
+    text_records,
 )
-from sst_graph.data.point_files.text import text_records
 from sst_graph.errors import DataError, count_of
 
 _MAX_HEADER = 64 * 1024

@@ -60,7 +60,7 @@ def cloud_of(message: Any, stamp_ns: int, place: str, times: bool = True, labels
 
 
 def _cloud(table: NDArray[Any], stamp_ns: int, place: str, times: bool, labels: bool) -> Cloud:
-    points = np.stack([_floats(table, axis) for axis in "xyz"], axis=1).astype(np.float32)
+    points = np.stack([np.asarray(table[axis], np.float64) for axis in "xyz"], axis=1).astype(np.float32)
     # Drivers give NaN or the origin for beams without a return.
     used = np.isfinite(points).all(axis=1) & (points != 0.0).any(axis=1)
     table, points = table[used], np.ascontiguousarray(points[used])
@@ -116,10 +116,6 @@ def _table(message: Any, place: str) -> NDArray[Any]:
         }
     )
     return np.asarray(packed.reshape(-1).view(table))
-
-
-def _floats(table: NDArray[Any], name: str) -> NDArray[np.float64]:
-    return np.asarray(table[name], np.float64)
 
 
 def _names(table: NDArray[Any]) -> tuple[str, ...]:

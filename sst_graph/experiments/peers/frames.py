@@ -78,10 +78,6 @@ class PeerProblem:
     samples: int = 1000
     seed: int = 0
 
-    @property
-    def has_intensities(self) -> bool:
-        return all(frame.intensities is not None for frame in self.frames)
-
 
 Peer = Callable[[PeerProblem, gtsam.Pose3], gtsam.Pose3]
 """Refines a start; raises an EstimationError where it cannot."""

@@ -8,6 +8,7 @@ import time
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import cast
 
 import gtsam
 import numpy as np
@@ -224,14 +225,9 @@ def _read(place: str, number: int, config: PeersConfig) -> _ReadDrive:
 def _solver(read: _ReadDrive, method: str, config: PeersConfig) -> _Solver:
     if method in PEERS:
         return _by_peer(read.problem, method, config)
-    own = dataclasses.replace(config.calibration, method=_method(method))
+    own = dataclasses.replace(config.calibration, method=cast(Method, method))
     drive = prepare_drives([read.source], own)[0] if method == "edges" else read.drive
     return _by_package(drive, own, read.problem.time_offset_s)
-
-
-def _method(name: str) -> Method:
-    names: dict[str, Method] = {"joint": "joint", "edges": "edges", "paper": "paper", "semalign": "semalign"}
-    return names[name]
 
 
 def _by_peer(problem: PeerProblem, method: str, config: PeersConfig) -> _Solver:

@@ -112,7 +112,7 @@ def solve_mutual_information(problem: PeerProblem, start: gtsam.Pose3) -> gtsam.
 
 
 def _require(problem: PeerProblem) -> None:
-    if not problem.has_intensities:
+    if any(frame.intensities is None for frame in problem.frames):
         raise EstimationError("the data tell no intensities")
 
 

@@ -26,7 +26,7 @@ _SIGMAS = (
     "sigma_trans_z_cm",
     "sigma_time_offset_ms",
 )
-_POSE = ("trans_x_m", "trans_y_m", "trans_z_m", "quat_x", "quat_y", "quat_z", "quat_w", "time_offset_s")
+_POSE = ("trans_x_m", "trans_y_m", "trans_z_m", "quat_x", "quat_y", "quat_z", "quat_w")
 
 
 def drive_rows(
@@ -100,9 +100,9 @@ def vehicle_rows(vehicles: Sequence[Vehicle]) -> list[Row]:
 
 def _pose(T: Any) -> Row:
     if T is None:
-        return dict.fromkeys(_POSE[:7])
+        return dict.fromkeys(_POSE)
     q: Any = gtsam.Pose3(T).rotation().toQuaternion()
-    return dict(zip(_POSE[:7], map(float, (*T[:3, 3], q.x(), q.y(), q.z(), q.w())), strict=True))
+    return dict(zip(_POSE, map(float, (*T[:3, 3], q.x(), q.y(), q.z(), q.w())), strict=True))
 
 
 def csv_bytes(rows: Sequence[Row]) -> bytes:

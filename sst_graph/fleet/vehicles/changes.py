@@ -85,12 +85,12 @@ def find_changes(drives: Sequence[DriveEstimate], config: WalkConfig) -> Finding
 
 def _next(state: Findings, config: WalkConfig, hypotheses: int) -> Findings | None:
     """With the least likely hypothesis that is left taken as true, or None where none is unlikely enough."""
-    left, ways = state.left, passes(state.left, state.steps, config)
+    left, both_ways = state.left, passes(state.left, state.steps, config)
     candidates: list[tuple[tuple[float, float], int, bool, Finding]] = []
     for k in range(len(left)):
         for a_step, finding in (
-            (True, _step(ways, k, hypotheses)),
-            (False, _alone(ways, left, k, hypotheses)),
+            (True, _step(both_ways, k, hypotheses)),
+            (False, _alone(both_ways, left, k, hypotheses)),
         ):
             if finding is not None:
                 candidates.append((finding.difference.rank, k, a_step, finding))
@@ -111,15 +111,15 @@ _ROUNDING = 1e-3
 """Relative difference of two chi-squared of the same hypothesis: what linearization leaves of it."""
 
 
-def _step(ways: Passes, k: int, hypotheses: int) -> Finding | None:
+def _step(both_ways: Passes, k: int, hypotheses: int) -> Finding | None:
     """A step between drive k - 1 and drive k, if they are tied."""
-    earlier = ways.before[k]
-    return None if earlier is None else _compared(earlier, ways.since[k], hypotheses)
+    earlier = both_ways.before[k]
+    return None if earlier is None else _compared(earlier, both_ways.since[k], hypotheses)
 
 
-def _alone(ways: Passes, left: Sequence[DriveEstimate], k: int, hypotheses: int) -> Finding | None:
+def _alone(both_ways: Passes, left: Sequence[DriveEstimate], k: int, hypotheses: int) -> Finding | None:
     """Drive k against all others of its stretch, if there are any."""
-    earlier, later = ways.before[k], ways.after[k]
+    earlier, later = both_ways.before[k], both_ways.after[k]
     if earlier is None or later is None:
         others = later if earlier is None else earlier
     else:
@@ -154,8 +154,8 @@ def _merged(state: Findings, config: WalkConfig, hypotheses: int) -> Findings:
         without = _without(replace(state, steps=steps), k, state.steps[k])
         finding = _step(passes(without.left, without.steps, config), k, hypotheses)
         if finding is not None and finding.p_value >= config.false_alarm_rate:
-            ways = passes(state.left, steps, config)
-            alone = _alone(ways, state.left, k, hypotheses)
+            both_ways = passes(state.left, steps, config)
+            alone = _alone(both_ways, state.left, k, hypotheses)
             if alone is not None:
                 return _without(replace(state, steps=steps), k, alone)
     return state

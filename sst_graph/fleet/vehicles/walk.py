@@ -90,9 +90,9 @@ def smoothed(drives: Sequence[DriveEstimate], steps: Collection[int], config: Wa
     Raises:
         EstimationError: a direction that no drive determines.
     """
-    ways = passes(drives, steps, config)
+    both_ways = passes(drives, steps, config)
     found = []
-    for upto, after in zip(ways.upto, ways.after, strict=True):
+    for upto, after in zip(both_ways.upto, both_ways.after, strict=True):
         both = upto if after is None else upto.plus(after)
         cTl, time_offset_s = both.own.best()
         found.append(Smoothed(cTl, time_offset_s, both.own.covariance(), both.common_covariance()))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -36,9 +36,6 @@ class SweptSource(SourceView):
         """Frame at a position; IndexError as the source's own."""
         frame = self._ahead.frame(position)
         return replace(frame, scan=self._timed(frame.scan))
-
-    def __iter__(self) -> Iterator[Frame]:
-        return (self[position] for position in range(len(self)))
 
     def read_scan(self, position: int) -> Scan | None:
         """Scan of the frame at a position."""

@@ -9,23 +9,22 @@ degrees from the axis of a fisheye it is about 1.6 times as large.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import cv2
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.cameras import CameraModel
+from sst_graph.data.source_view import SourceView
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.simulator.camera.render import developed
 from sst_graph.simulator.camera.segmentation import noisy_mask
 from sst_graph.simulator.drive import SimulatedDrive
 from sst_graph.simulator.surfaces import SEMANTIC_CLASS, Kind
-from sst_graph.types import CameraImage, FloatArray, Frame, GroundTruth, Scan, SemanticClass
+from sst_graph.types import CameraImage, FloatArray, Frame, SemanticClass
 
 FINER = 2.0
 """Pixels of a pinhole for one of the lens at its axis."""
@@ -49,8 +48,7 @@ class _Part:
     uvs: NDArray[np.float32]
 
 
-@dataclass(frozen=True)
-class LensDrive:
+class LensDrive(SourceView):
     """A simulated drive whose images a distorted camera takes (satisfies :class:`sst_graph.types.Source`).
 
     Attributes:
@@ -58,8 +56,10 @@ class LensDrive:
         model: the camera.
     """
 
-    drive: SimulatedDrive
-    model: CameraModel
+    def __init__(self, drive: SimulatedDrive, model: CameraModel) -> None:
+        self.source = self.drive = drive
+        self.model = model
+        self.sweep = drive.sweep
 
     @property
     def name(self) -> str:
@@ -71,39 +71,9 @@ class LensDrive:
         """Intrinsics of the lens: the images are to be rectified."""
         return self.model.intrinsics
 
-    @property
-    def nominal(self) -> gtsam.Pose3:
-        """The extrinsic that the data claims."""
-        return self.drive.nominal
-
-    @property
-    def truth(self) -> GroundTruth:
-        """The true extrinsic and time offset."""
-        return self.drive.truth
-
-    @property
-    def sweep(self) -> str:
-        """As the drive's."""
-        return self.drive.sweep
-
-    def __len__(self) -> int:
-        return len(self.drive)
-
-    def __iter__(self) -> Iterator[Frame]:
-        return (self[position] for position in range(len(self)))
-
     def __getitem__(self, position: int) -> Frame:
         """Frame at ``position``; errors as the drive's."""
-        scan = self.read_scan(position)
-        return Frame(self.frame_number(position), scan, self.read_image(position))
-
-    def frame_number(self, position: int) -> int:
-        """Index of the frame at ``position``."""
-        return range(len(self))[position]
-
-    def read_scan(self, position: int) -> Scan:
-        """The scan of a frame."""
-        return self.drive.scan(position)
+        return Frame(self.frame_number(position), self.drive.scan(position), self.read_image(position))
 
     def read_image(self, position: int) -> CameraImage:
         """The picture of a frame; black and IGNORE where the lens sees nothing."""

@@ -16,8 +16,9 @@ from sst_graph.graph.matching import Tracks
 from sst_graph.stepwise import Stepwise
 from sst_graph.tracker.by_edges.review import EdgeReview, review_steps
 from sst_graph.tracker.config import TrackerConfig
-from sst_graph.tracker.start.first_estimate import FirstEstimate, StartGuess, Stretch
+from sst_graph.tracker.start.first_estimate import FirstEstimate, StartGuess
 from sst_graph.tracker.window.gaussian import Point
+from sst_graph.tracker.window.window import Stretch
 
 _MOTION_WORK = 30
 """To find what motion says, in units of work."""

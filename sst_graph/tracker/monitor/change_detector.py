@@ -9,11 +9,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sst_graph.covariance.error_model import ErrorModel
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.monitor.confirmation import (
@@ -75,9 +74,9 @@ class Reference:
     covariance: EstimateCovariance
     scan: int
 
-    def compared(self, model: ErrorModel) -> ComparedEstimate:
-        """For frames whose residuals have some variances."""
-        return ComparedEstimate(self.point, self.covariance, model)
+    def compared(self, running: ComparedEstimate) -> ComparedEstimate:
+        """For frames whose residuals and scores vary as those of the running estimate."""
+        return replace(running, point=self.point, covariance=self.covariance, scans=())
 
 
 class ChangeDetector:
@@ -134,66 +133,55 @@ class ChangeDetector:
         self._start_scan, self._recheck_after = scan, self._first_recheck
         self.start_unconfirmed = self.config.enabled
 
-    def check_start(self, scans: Sequence[int], estimate: ComparedEstimate) -> str:
+    def check_start(self, estimate: ComparedEstimate) -> str:
         """How frames contradict the estimate that was made of them, in words; empty where they do not.
 
         Where the calibration changed among the frames of a start, or where the start was wrong, its estimate
         is between two calibrations or at neither, with a covariance that does not show it.
-
-        Args:
-            scans: numbers of the scans in the estimate.
         """
         if not self.config.enabled or self.refused_starts >= _MAX_REFUSED_STARTS:
             return ""
-        value = self._disagreement(scans, estimate, self.matcher.window.dynamics.recently_moving())
+        value = self._disagreement(estimate, self.matcher.window.dynamics.recently_moving())
         if value <= self.start_threshold:
             return ""
         self.refused_starts += 1
         return f"frames of the start contradict each other (chi-square {value:.0f}): it is estimated again"
 
-    def recheck_start(self, scan: int, scans: Sequence[int], estimate: ComparedEstimate) -> None:
+    def recheck_start(self, scan: int, estimate: ComparedEstimate) -> None:
         """The same check with half as many further frames, and then after each doubling. Wrong labels
         contradict a start as a change does, so the start is not given up; but until its frames agree, the
         status is not ``ok``.
         """
         if self.start_unconfirmed and scan - self._start_scan >= self._recheck_after:
             self._recheck_after *= 2
-            self._confirm_start(scans, estimate, self._moving, self.start_threshold)
+            self._confirm_start(estimate, self._moving, self.start_threshold)
 
-    def check_start_at_end(self, scans: Sequence[int], estimate: ComparedEstimate) -> None:
+    def check_start_at_end(self, estimate: ComparedEstimate) -> None:
         """At the end of a drive, the same check of all frames in the graph, for a start without later frames.
         They are more than a start has, so the threshold for new frames applies.
         """
-        self._confirm_start(scans, estimate, self.matcher.window.dynamics.recently_moving(), self.config.chi2)
+        self._confirm_start(estimate, self.matcher.window.dynamics.recently_moving(), self.config.chi2)
 
-    def confirm_at_end(self, scans: Sequence[int], estimate: ComparedEstimate) -> None:
-        """The frames of the window confirm the estimate where no part of them contradicts it.
-
-        Args:
-            scans: numbers of the scans in the estimate.
-        """
+    def confirm_at_end(self, estimate: ComparedEstimate) -> None:
+        """The frames of the window confirm the estimate where no part of them contradicts it."""
         moving = self.matcher.window.dynamics.recently_moving()
-        if not self.start_unconfirmed and self._disagreement(scans, estimate, moving) <= self.config.chi2:
+        if not self.start_unconfirmed and self._disagreement(estimate, moving) <= self.config.chi2:
             self.confirmation.begin()
 
     def start_is_over(self, scan: int) -> bool:
         """Whether a contradiction is a change of the calibration from this scan on, not a wrong start."""
         return scan - self._start_scan >= self.warm_up_scans or self.refused_starts >= _MAX_REFUSED_STARTS
 
-    def _confirm_start(
-        self, scans: Sequence[int], estimate: ComparedEstimate, moving: Collection[int], threshold: float
-    ) -> None:
-        if self.start_unconfirmed and self._disagreement(scans, estimate, moving) <= threshold:
+    def _confirm_start(self, estimate: ComparedEstimate, moving: Collection[int], threshold: float) -> None:
+        if self.start_unconfirmed and self._disagreement(estimate, moving) <= threshold:
             self.refused_starts, self.start_unconfirmed = 0, False
 
-    def _disagreement(
-        self, scans: Sequence[int], estimate: ComparedEstimate, moving: Collection[int]
-    ) -> float:
+    def _disagreement(self, estimate: ComparedEstimate, moving: Collection[int]) -> float:
         """Largest statistic of a part of the frames that an estimate was made of, against that estimate.
 
         The parts are its first ones, its last ones, and any few in a row.
         """
-        pairs = self.matcher.pairs_at(estimate.point, sorted(scans), _KERNEL)
+        pairs = self.matcher.pairs_at(estimate.point, sorted(estimate.scans), _KERNEL)
         scores = [
             self.matcher.linearized({scan: pairs[scan]}, estimate.point, moving) for scan in sorted(pairs)
         ]
@@ -244,7 +232,7 @@ class ChangeDetector:
         self._before.append(Reference(estimate.point, estimate.covariance, min(views)))
         against = self.reference or self._before[-1]
         scores = self.matcher.linearized_at(against.point, list(views), _KERNEL, self._moving)
-        value = self.statistic.add(scores, against.compared(estimate.model))
+        value = self.statistic.add(scores, against.compared(estimate))
         # 3. Keep the reference, or discard it.
         if self.statistic.exceeded > self.max_pending:
             self.confirmation.unreliable |= self.matcher.objects_of(self.scans) - self._moving
@@ -336,7 +324,7 @@ class ChangeDetector:
         """
         scans = [scan for scan in self.scans if scan >= reference.scan]
         pairs = self.matcher.pairs_at(reference.point, scans, _KERNEL)
-        against = reference.compared(estimate.model)
+        against = reference.compared(estimate)
 
         def value(*without: int) -> float:
             scores = self.matcher.linearized(pairs, reference.point, {*without, *self._moving})

@@ -64,14 +64,7 @@ class Confirmation:
 def steps(cTl: gtsam.Pose3, turn_rad: float, time_offset_s: float) -> FloatArray:
     """(7, 3) of extrinsic and time offset: turns of the camera about its x and its y axis, a clock's jump."""
     found = np.zeros((7, 3))
-    found[:6, :2] = camera_turns(cTl) * turn_rad
+    # Exp(d_c) cTl = cTl Exp(Ad(cTl^-1) d_c).
+    found[:6, :2] = cTl.inverse().AdjointMap()[:, :2] * turn_rad
     found[6, 2] = time_offset_s
     return found
-
-
-def camera_turns(cTl: gtsam.Pose3) -> FloatArray:
-    """(6, 2) tangents of the extrinsic for turns of the camera by 1 rad about its own x and y axis.
-
-    Exp(d_c) cTl = cTl Exp(Ad(cTl^-1) d_c).
-    """
-    return np.asarray(cTl.inverse().AdjointMap()[:, :2])

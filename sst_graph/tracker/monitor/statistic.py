@@ -68,11 +68,16 @@ class ComparedEstimate:
         point: the estimate.
         covariance: of it.
         model: variances of residuals, for the frames' scores.
+        scans: numbers of the scans that it was made of.
+        variance_ratio: how many times the variance of the scores is that of frozen matches: edges of pictures
+            follow the pose, contours of masks do not.
     """
 
     point: Point
     covariance: EstimateCovariance
     model: ErrorModel
+    scans: tuple[int, ...] = ()
+    variance_ratio: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -90,12 +95,14 @@ class Comparison:
         jacobian: H (n, m) of g by these and by the biases of the objects seen.
         noise: M (n, n) variance of g by the matches, cluster-robust.
         prior: P (m, m) covariance of the estimate.
+        variance_ratio: of the estimate.
     """
 
     gradient: FloatArray
     jacobian: FloatArray
     noise: FloatArray
     prior: FloatArray
+    variance_ratio: float
 
     def chi2(self) -> float:
         """T of the frames."""
@@ -118,6 +125,7 @@ class ComparedScores:
         sums: of each pair's scores, in the n unknowns.
         prior: P (m, m).
         model: variances of residuals.
+        variance_ratio: of the estimate.
     """
 
     gradients: FloatArray
@@ -125,6 +133,7 @@ class ComparedScores:
     sums: Sequence[ScoreSums]
     prior: FloatArray
     model: ErrorModel
+    variance_ratio: float
 
     @classmethod
     def of(
@@ -143,15 +152,16 @@ class ComparedScores:
         # A few frames do not determine the objects' biases; at least the variance of independent matches.
         least = replace(model, match=max(1.0, model.match))
         sums = [score.scores.columns(slice(n)) for score in scores]
-        return cls(g, H, sums, covariance.with_objects(places, object_sigma_px), least)
+        prior = covariance.with_objects(places, object_sigma_px)
+        return cls(g, H, sums, prior, least, estimate.variance_ratio)
 
     def part(self, start: int, end: int) -> Comparison:
         """The comparison of some of the pairs, one after the other."""
         n, sums = self.gradients.shape[1], self.sums[start:end]
         noise = total(n, sums, [np.arange(n)] * len(sums)).variance(self.model)
         noise = noise + _LEAST_INFORMATION * np.eye(n)
-        jacobian = self.jacobians[start:end].sum(axis=0)
-        return Comparison(self.gradients[start:end].sum(axis=0), jacobian, noise, self.prior)
+        gradient, jacobian = (each[start:end].sum(axis=0) for each in (self.gradients, self.jacobians))
+        return Comparison(gradient, jacobian, noise, self.prior, self.variance_ratio)
 
 
 class ChangeStatistic:
@@ -162,8 +172,6 @@ class ChangeStatistic:
         object_sigma_px: standard deviation of a new object's mask bias from its class's [px].
         recent: scores of the latest frames.
         usual: T of earlier quiet frames.
-        variance_ratio: how many times the variance of the scores is that of frozen matches: edges of pictures
-            follow the pose, contours of masks do not.
         exceeded: frames in a row past the threshold.
         latest: the latest comparison; None before one.
     """
@@ -172,7 +180,6 @@ class ChangeStatistic:
         self.threshold, self.object_sigma_px = threshold, object_sigma_px
         self.recent: deque[LinearizedPair] = deque(maxlen=FRAMES)
         self.usual: deque[float] = deque(maxlen=_USUAL_FRAMES)
-        self.variance_ratio = 1.0
         self.exceeded = 0
         self.latest: Comparison | None = None
 
@@ -189,7 +196,7 @@ class ChangeStatistic:
             return None
         self.latest = self.compare(self.recent, estimate)
         T = self.latest.chi2()
-        value = T / self._scale(estimate.covariance.core_size)
+        value = T / self._scale(self.latest)
         if value > self.threshold:
             self.exceeded += 1
         else:
@@ -213,24 +220,24 @@ class ChangeStatistic:
 
     def normalized(self, comparison: Comparison) -> float:
         """T over its usual size."""
-        return comparison.chi2() / self._scale(len(comparison.gradient))
+        return comparison.chi2() / self._scale(comparison)
 
     def detectable(self, comparison: Comparison, steps: FloatArray) -> NDArray[np.bool_]:
         """(k,) which steps (7, k) of extrinsic and offset would be past the threshold."""
-        least = self.threshold * self._scale(len(comparison.gradient))
-        return np.asarray(comparison.chi2_of(steps) > least)
+        return np.asarray(comparison.chi2_of(steps) > self.threshold * self._scale(comparison))
 
     @property
     def confirmed(self) -> bool:
         """Past the threshold often enough in a row."""
         return self.exceeded >= CONFIRMATIONS
 
-    def _scale(self, freedom: int) -> float:
+    def _scale(self, comparison: Comparison) -> float:
         """How much larger than chi-squared's the usual 90th percentile is; at least the variance ratio."""
         if len(self.usual) < _LEAST_USUAL_FRAMES:
-            return self.variance_ratio
+            return comparison.variance_ratio
+        freedom = len(comparison.gradient)
         expected = freedom + 1.28 * float(np.sqrt(2.0 * freedom))
-        return max(self.variance_ratio, float(np.quantile(self.usual, 0.9)) / expected)
+        return max(comparison.variance_ratio, float(np.quantile(self.usual, 0.9)) / expected)
 
 
 def _squared(gradient: FloatArray, variance: FloatArray) -> float:

@@ -1,16 +1,13 @@
-"""Where a first estimate begins, what it is made of, and what it is."""
+"""Where a first estimate begins, and what it is."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import gtsam
 
 from sst_graph.batch.by_edges.problem import KnownCalibration
-from sst_graph.drive.preparation import Drive
-from sst_graph.objects.dynamic_objects import DynamicObject
-from sst_graph.objects.tracks import ObjectId
 from sst_graph.tracker.by_edges.review import EdgeReview
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.types import Guess, SemanticClass
@@ -29,23 +26,6 @@ class StartGuess(Guess):
     def point(self, classes: tuple[SemanticClass, ...], names: Sequence[str] = ()) -> Point:
         """With mask biases and parameters (``names``) of 0; the identity where nothing is known."""
         return Point.unbiased(self.cTl or gtsam.Pose3(), self.time_offset_s, classes, names)
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """Scans that a first estimate is made of.
-
-    Attributes:
-        drive: with their images and motions.
-        tracks: of their objects.
-        dynamic: those that move.
-        at_end: all that there is: the estimate is reviewed after it.
-    """
-
-    drive: Drive
-    tracks: Mapping[ObjectId, int] = field(default_factory=dict)
-    dynamic: Mapping[ObjectId, DynamicObject] = field(default_factory=dict)
-    at_end: bool = False
 
 
 @dataclass(frozen=True)

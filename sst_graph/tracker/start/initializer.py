@@ -12,14 +12,15 @@ from sst_graph.tracker.by_edges.kinds import by_edges, by_labels, of_kind
 from sst_graph.tracker.by_edges.review import variance_ratio
 from sst_graph.tracker.by_edges.start import first_edge_estimate_steps
 from sst_graph.tracker.config import TrackerConfig
+from sst_graph.tracker.monitor.statistic import ComparedEstimate
 from sst_graph.tracker.spread_work import NUMERICAL_ERRORS, SpreadWork
-from sst_graph.tracker.start.first_estimate import FirstEstimate, StartGuess, Stretch
+from sst_graph.tracker.start.first_estimate import FirstEstimate, StartGuess
 from sst_graph.tracker.start.solution import first_estimate_steps, prior_gaussian
 from sst_graph.tracker.uncertainty import Uncertainty
 from sst_graph.tracker.window.epochs import MatchedPair
 from sst_graph.tracker.window.matcher import WindowMatcher
 from sst_graph.tracker.window.smoother import WindowSmoother
-from sst_graph.tracker.window.window import Window
+from sst_graph.tracker.window.window import Stretch, Window
 
 _WORK_PER_FRAME = 36
 """Work on a start with each frame, in units of 4 ms: the estimate comes when all is done, some frames
@@ -76,10 +77,10 @@ class Initialization:
     scans: int
     first: FirstEstimate
 
-    @property
-    def variance_ratio(self) -> float:
-        """Of its matches (:func:`~sst_graph.tracker.by_edges.review.variance_ratio`)."""
-        return variance_ratio(self.first.review, self.uncertainty.covariance)
+    def for_comparison(self) -> ComparedEstimate:
+        """For the comparison of frames with it."""
+        ratio = variance_ratio(self.first.review, self.uncertainty.covariance)
+        return self.uncertainty.compared(self.smoother, ratio)
 
 
 def start_steps(stretch: Stretch, guess: StartGuess, config: TrackerConfig) -> Stepwise[FirstEstimate]:
@@ -246,9 +247,8 @@ class Initializer:
     def _search(self, window: Window, whole: bool = False) -> Search:
         """Over the latest scans, no more than twice as many as are needed: a step's work grows with them; or
         over the whole window, as at the end of a drive."""
-        drive, numbers = window.latest(len(window.scans) if whole else 2 * self.needed)
-        found = window.objects_of(numbers) if window.edges else ({}, {})
-        return Search(Stretch(drive, *found, at_end=whole), numbers, self.guess, self.config)
+        stretch, numbers = window.latest(len(window.scans) if whole else 2 * self.needed)
+        return Search(replace(stretch, at_end=whole), numbers, self.guess, self.config)
 
     def _begin_graph(self, window: Window, first: FirstEstimate, searched: Sequence[int]) -> None:
         """Begin with the graph of the scans that an estimate was made of.

@@ -40,15 +40,15 @@ from sst_graph.files.object_store import (
 )
 from sst_graph.files.reading import FileKind, parse_json, path_of, read_file
 from sst_graph.odometry.sweep import SweepDecision
-from sst_graph.tracker.make_update import current_update
 from sst_graph.tracker.storage.resume import Setup, check_inputs, check_setup
+from sst_graph.tracker.track_update import current_update
 from sst_graph.types import NO_PICTURE, CameraImage
 
 if TYPE_CHECKING:
     from sst_graph.tracker.tracker import Tracker
 
 FORMAT = "sst-graph/tracker"
-VERSION = 28
+VERSION = 29
 """Goes up whenever what a tracker holds changes: a checkpoint is for the version that wrote it."""
 
 CHECKPOINT = FileKind("a checkpoint of the tracker", 512 * 1024 * 1024)
@@ -122,7 +122,7 @@ class Saver:
         Raises:
             OSError: it cannot be written; what stood there is untouched.
         """
-        for value in _lasting(tracker):
+        for value in _immutable_parts(tracker):
             self._blocks.number(value)
         if self._saved is not None:
             self._store()
@@ -147,7 +147,7 @@ class Saver:
         with _without_gc():
             node, rest, blocks = self._blocks.stored(self._saved)
         self._saved = None
-        self._writing = atomic_write_in_steps(self._path, partial(_filling, node, rest, blocks))
+        self._writing = atomic_write_in_steps(self._path, partial(_write_in_steps, node, rest, blocks))
         if len(rest) + sum(len(block.data) for block in blocks) < _STEP_BYTES:
             self.finish()
 
@@ -177,7 +177,7 @@ def consolidate(tracker: Tracker, laid_out: Container[int] = ()) -> None:
         tracker.estimate.smoother.relinearize()
 
 
-def _lasting(tracker: Tracker) -> Iterator[object]:
+def _immutable_parts(tracker: Tracker) -> Iterator[object]:
     """The immutable parts of a tracker, which are most of it."""
     yield from (features for _, features in tracker.inputs.window.scans)
     yield from tracker.inputs.window.images
@@ -197,7 +197,7 @@ def _without_gc() -> Iterator[None]:
             gc.enable()
 
 
-def _filling(node: Node, rest: bytes, blocks: Sequence[Block], stream: BinaryIO) -> Iterator[None]:
+def _write_in_steps(node: Node, rest: bytes, blocks: Sequence[Block], stream: BinaryIO) -> Iterator[None]:
     """Write a tracker as :func:`numpy.savez` does, with its checksum, some with each step."""
     # 1. JSON, the blocks' as it is there already, and all bytes.
     yield
@@ -335,7 +335,7 @@ def _check_tracker(tracker: Tracker, path: str | Path) -> None:
         _catch_up(tracker)
         current_update(tracker, tracker.last_update).to_dict()
         consolidate(tracker)
-        _again(tracker)
+        _repeat_last_frame(tracker)
         current_update(tracker).to_dict()
         stored(tracker)
     except Exception as error:
@@ -351,7 +351,7 @@ def _catch_up(tracker: Tracker) -> None:
             under_way.catch_up()
 
 
-def _again(tracker: Tracker) -> None:
+def _repeat_last_frame(tracker: Tracker) -> None:
     """The last frame once more, a second later."""
     scan, images = tracker.inputs.last_scan, tracker.inputs.window.images
     stamps = [one.stamp_ns for one in (scan, *images) if one is not None]

@@ -85,11 +85,6 @@ class PairColumns:
     held: Sequence[str] = ()
     config: MatchConfig = field(default_factory=MatchConfig)
 
-    @property
-    def held_assumptions(self) -> list[str]:
-        """Those whose parameters are held."""
-        return [name for name in self.held if name not in EDGE_ERRORS]
-
     def object_places(self, pair: PairMatches) -> dict[int, int]:
         """Place of its class's bias for each object of a pair, if objects have a bias of their own."""
         return {
@@ -139,11 +134,12 @@ def linearize_pair(
     J = J - JV @ gain  # sensitivity of the estimate to a residual, the twist at its optimum
     track = np.concatenate([columns.tracks_of(pair, c) for c in pair.matches])
     side = track * SIDES + np.concatenate([m.sides for m in pair.matches.values()])
-    own = roots / np.sqrt(share)
+    own, scores = roots / np.sqrt(share), ScoreSums.of_frame(J, roots, side)
     return LinearizedPair(
         information,
         observed,
-        _with_share(ScoreSums.of_frame(J, roots, side), share),
+        # The errors are those of the matches' original weights.
+        replace(scores, independent=share * scores.independent),
         SideResiduals.of(unweighted(r, roots), own**2, side),
         len(pair),
         places,
@@ -152,12 +148,6 @@ def linearize_pair(
         curvature,
         _by_static_objects(pair, point, A[:, known], motion[np.ix_(known, known)]),
     )
-
-
-def _with_share(scores: ScoreSums, share: float) -> ScoreSums:
-    """Scores of matches whose weights are multiplied by a common factor; the errors are those of the original
-    weights."""
-    return replace(scores, independent=share * scores.independent)
 
 
 def _by_static_objects(pair: PairMatches, point: Point, A: FloatArray, motion: FloatArray) -> Gaussian | None:
@@ -194,7 +184,8 @@ def _rows(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Weighted rows of all matches by unknowns and held parameters (m, n) and twist (m, 6), residuals and
     root weights (m,)."""
-    classes, held, assumptions = names.classes, names.held, names.held_assumptions
+    classes, held = names.classes, names.held
+    assumptions = [name for name in held if name not in EDGE_ERRORS]
     blocks, twists, residuals, roots = [], [], [], []
     for c, matches in pair.matches.items():
         alignment, place = matches.alignment, classes.index(c)

@@ -59,16 +59,6 @@ class ObjectInformation:
         weights = np.add.reduceat(roots[order] ** 2, bounds[:-1])
         return cls(point, names, information, vector, biases, weights)
 
-    def by_track(self) -> dict[int, SingleObject]:
-        """By track."""
-        return {
-            track: SingleObject(
-                Gaussian(_restricted(self.point, track), self.information[k], self.vector[k]),
-                float(self.weights[k]),
-            )
-            for k, track in enumerate(self.tracks)
-        }
-
     @classmethod
     def single(cls, track: int, own: SingleObject) -> ObjectInformation:
         """One object."""
@@ -115,7 +105,11 @@ class ObjectSums:
 
     def add(self, objects: ObjectInformation) -> None:
         """Add the objects of a frame."""
-        for track, own in objects.by_track().items():
+        for k, track in enumerate(objects.tracks):
+            # With its own bias, if it has one.
+            point = objects.point.seen({track: 0} if track in objects.point.tracks else {})
+            matches = Gaussian(point, objects.information[k], objects.vector[k])
+            own = SingleObject(matches, float(objects.weights[k]))
             self.live[track] = self.live[track].plus(own) if track in self.live else own
 
     def transform(self, T: FloatArray) -> None:
@@ -161,11 +155,6 @@ class ObjectSums:
 
     def copy(self) -> ObjectSums:
         return replace(self, live=dict(self.live))
-
-
-def _restricted(point: Point, track: int) -> Point:
-    """A point with one object's bias, or none where it has none of its own."""
-    return point.seen({track: 0}) if track in point.tracks else point.core()
 
 
 def _weights_by_track(parts: Sequence[ObjectInformation]) -> FloatArray:

@@ -178,7 +178,9 @@ class Gaussian:
 
     def at(self, point: Point) -> Gaussian:
         """The same about another, near point; objects that are new there are left out."""
-        point = point if point.tracks == self.point.tracks else _like(self.point, point)
+        known = self.point.tracks
+        if point.tracks != known:
+            point = replace(point, tracks=known, object_biases_px=_picked(point, known))
         moved = self.information[:, : self.point.size] @ self.point.local(point)
         return Gaussian(point, self.information, self.vector - moved)
 
@@ -328,11 +330,6 @@ def core_steps(points: Sequence[Point], to: Point) -> FloatArray:
     biases = np.array([point.biases_px for point in points]).reshape(len(turns), -1)
     parameters = np.array([point.parameters for point in points]).reshape(len(turns), -1)
     return np.column_stack([turns, offsets, to.biases_px - biases, to.parameters - parameters])
-
-
-def _like(target: Point, source: Point) -> Point:
-    """The source's values, with the objects of the target."""
-    return replace(source, tracks=target.tracks, object_biases_px=_picked(source, target.tracks))
 
 
 def _picked(point: Point, tracks: Sequence[int]) -> FloatArray:

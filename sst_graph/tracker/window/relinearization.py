@@ -1,12 +1,13 @@
-"""The whole window matched and solved again as the batch does, from a wide kernel to the narrowest.
+"""Scans of the window that are matched again: some with each frame, or all as the batch does.
 
-At the end of a drive at once (:func:`relinearize_window`); while frames come, a little with each
-(:class:`WindowRelinearization`).
+With each frame the newest is matched, and those whose matches are outdated (:func:`scans_to_match`). The
+whole window is matched and solved again from a wide kernel to the narrowest: at the end of a drive at once
+(:func:`relinearize_window`); while frames come, a little with each (:class:`WindowRelinearization`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Collection, Container
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,10 +17,9 @@ from sst_graph.batch.by_edges.optimum import CONVERGED_STEP
 from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX
 from sst_graph.batch.lower_edges import LowerEdgeSupport
 from sst_graph.factors.robust import RobustKernel
-from sst_graph.graph.convergence import step_share
-from sst_graph.graph.outer_loop import NARROW_KERNELS_PX
+from sst_graph.graph.outer_loop import NARROW_KERNELS_PX, step_share
 from sst_graph.tracker.by_edges.kinds import by_edges
-from sst_graph.tracker.window.gaussian import Point, inverted
+from sst_graph.tracker.window.gaussian import Point, core_steps, inverted
 from sst_graph.tracker.window.matcher import WindowMatcher
 from sst_graph.tracker.window.smoother import WindowSmoother
 
@@ -35,6 +35,15 @@ SCANS = 5
 """Scans matched with each frame while the window is matched again: more make these frames slower."""
 _PASSES = 2
 """How often a running tracker matches the whole window when it relinearizes."""
+_FRESH_SIGMAS = 0.02
+"""A scan is matched once more before it leaves the window if the estimate has moved farther since."""
+_IN_TURN = 1
+"""Scans matched again with each frame besides the newest, the most outdated first: each costs as much as the
+newest."""
+_MOST_IN_TURN = 4
+"""Most scans matched again while the estimate moves."""
+_STALE_SIGMAS = 0.3
+"""Matches are outdated where the estimate has moved farther since, in standard deviations."""
 
 
 @dataclass
@@ -76,7 +85,7 @@ def relinearize_window(
 
     Matches made frame by frame keep the estimate within one or two standard deviations of the batch's. Where
     some matches appear and disappear in turn, the estimate oscillates, and the steps are shortened as in the
-    batch (:mod:`sst_graph.graph.convergence`). The steps are Gauss-Newton's; the graph takes the last matches
+    batch (:mod:`sst_graph.graph.outer_loop`). The steps are Gauss-Newton's; the graph takes the last matches
     only.
 
     Args:
@@ -106,7 +115,7 @@ def relinearize_window(
     smoother.update(found, missing, 0, alive)
     smoother.optimize(_INNER)
     if not converged:
-        smoother.set_point(at)
+        smoother.point = at
     return converged
 
 
@@ -172,3 +181,61 @@ class WindowRelinearization:
         else:
             self._matcher.set_lower_edges(self.support)
             self.support = None
+
+
+def scans_to_match(
+    number: int,
+    matcher: WindowMatcher,
+    smoother: WindowSmoother,
+    entered: Collection[int],
+    covariance: FloatArray,
+    relinearization: WindowRelinearization | None,
+) -> set[int]:
+    """The newest, those still without a pair, those that leave next, and some in turn.
+
+    Args:
+        number: of the newest scan.
+        entered: scans that have had a pair.
+        covariance: (m, m) of the estimate, over [extrinsic, offset, biases].
+        relinearization: of the whole window, where one is under way; it chooses what is matched in turn.
+    """
+    window = matcher.window
+    numbers = [n for n, _ in window.scans]
+    waiting = [n for n in numbers if n not in smoother.entries and n not in entered]
+    # What cannot wait, and as many others as there is time for: those whose dynamic objects have changed,
+    # then those matched farthest from the estimate.
+    chosen = {number, *waiting[-4:], *(n for n in numbers[-2:] if n in smoother.entries)}
+    staleness = _staleness(smoother, covariance)
+    leaving = [n for n in window.leaving() if staleness.get(n, 1.0) > _FRESH_SIGMAS]
+    if relinearization is not None:
+        # Those that wait for a first match take the place of those in turn: a frame costs no more for them.
+        turn = relinearization.advance(smoother.point, max(0, len(waiting[-4:]) - 1)) or ()
+        # No others: all of the window come in their turn, and the lower edges cost as much.
+        return chosen | set(leaving) | (set(turn) & set(staleness))
+    known = sorted(staleness, key=staleness.__getitem__, reverse=True)
+    stale = sum([value > _STALE_SIGMAS for value in staleness.values()])
+    some = known[: max(_IN_TURN - len(leaving), stale)]
+    wanted = [*_with_changed_objects(matcher, smoother), *some]
+    return chosen | set(list(dict.fromkeys([*leaving, *wanted]))[:_MOST_IN_TURN])
+
+
+def _with_changed_objects(matcher: WindowMatcher, smoother: WindowSmoother) -> list[int]:
+    """Scans with a pair in which other dynamic objects are left out now; the rest are forgotten."""
+    window, found = matcher.window, []
+    for number in sorted(window.dynamics.changed_scans & set(smoother.entries)):
+        entry = smoother.entries[number]
+        if matcher.left_out(entry.pair, number, smoother.point.time_offset_s) != entry.left_out:
+            found.append(number)
+        else:
+            window.dynamics.changed_scans.discard(number)
+    return found
+
+
+def _staleness(smoother: WindowSmoother, covariance: FloatArray) -> dict[int, float]:
+    """How far the estimate has moved since each pair was matched, in standard deviations."""
+    if not smoother.entries:
+        return {}
+    points = [entry.linear.information.point for entry in smoother.entries.values()]
+    steps = core_steps(points, smoother.point)
+    squares = np.einsum("ij,ij->i", steps, np.linalg.solve(covariance, steps.T).T)
+    return dict(zip(smoother.entries, np.sqrt(np.maximum(0.0, squares)).tolist(), strict=True))

@@ -78,6 +78,8 @@ class WindowSmoother:
         static: the same as ``past`` by static objects alone.
         sums: of the covariance, over all that has left the window.
         model: error model of the matches.
+        epochs: those whose calibration is still a variable, oldest first.
+        point: the estimate of the last epoch.
         retired: epochs that have left the window, until the history takes them over.
         begun: the prior's factor in the graph is that of ``past``; it is from the first update on.
     """
@@ -104,28 +106,22 @@ class WindowSmoother:
         self.entries: dict[int, MatchedPair] = {}
         self.model = ErrorModel(0.0, 0.0, 1.0)
         self.retired: list[RetiredEpoch] = []
-        self._epochs: tuple[Epoch, ...] = (Epoch(0, start_ns),)
+        self.epochs: tuple[Epoch, ...] = (Epoch(0, start_ns),)
         self.ids: dict[int, int] = {}
         self.twists: dict[int, TwistFactor] = {}
         values = gtsam.Values()
-        self.begun = begin is None
-        begin = prior.mean() if begin is None else begin
+        self.begun, held_there = begin is None, None
+        if begin is None:
+            begin = prior.mean()
+        else:
+            # iSAM2 would move to the mean of the prior before it takes the first pairs.
+            held_there = gtsam.NonlinearFactorGraph()
+            centred = Gaussian(begin, prior.information, np.zeros(begin.size))
+            held_there.add(centred.factor(self.keys(0, begin.tracks)))
         insert_point(values, self.keys(0, prior.point.tracks), begin)
-        # iSAM2 would move to the mean of the prior before it takes the first pairs.
-        held_there = None if self.begun else self._held_at(begin)
         self.isam, (self.past_id,) = self._linearized(values, held_there)
-        self._point = begin
+        self.point = begin
         self.epoch_sums = EpochSums.empty(prior.point)
-
-    @property
-    def point(self) -> Point:
-        """The estimate of the last epoch."""
-        return self._point
-
-    @property
-    def epochs(self) -> tuple[Epoch, ...]:
-        """Epochs whose calibration is still a variable, oldest first."""
-        return self._epochs
 
     @property
     def matches(self) -> int:
@@ -168,19 +164,15 @@ class WindowSmoother:
 
     def _keep(self, update: SmootherUpdate) -> None:
         """Go on with what an update has prepared."""
-        self.isam, self.past_id, self._epochs = update.isam, update.past_id, update.epochs
+        self.isam, self.past_id, self.epochs = update.isam, update.past_id, update.epochs
         self.ids, self.twists, self.entries = update.ids, update.twists, update.entries
         self.past, self.observed, self.static = update.past, update.observed, update.static
         self.begun = True
         self.sums, self.epoch_sums = update.sums, update.epoch_sums
-        self._point = update.point
+        self.point = update.point
         self.retired += update.retired
         if self.entries or self.sums.recent:
             self.model = self.sums.error_model([entry.linear for entry in self.entries.values()])
-
-    def set_point(self, point: Point) -> None:
-        """Another estimate, until the next update."""
-        self._point = point
 
     def pair_factor(self, entry: MatchedPair) -> gtsam.NonlinearFactor:
         """The matches of a pair."""
@@ -216,11 +208,11 @@ class WindowSmoother:
             )
             isam, indices = self._linearized(optimizer.optimize())
             tracks, names = self.past.point.tracks, self.past.point.names
-            point = read_point(isam, self.keys(self._epochs[-1].number, tracks), tracks, names)
+            point = read_point(isam, self.keys(self.epochs[-1].number, tracks), tracks, names)
         except (RuntimeError, ValueError) as error:
             raise EstimationError(f"the window's optimisation failed: {error}") from error
         self._replace_isam(isam, indices)
-        self._point = point
+        self.point = point
 
     def relinearize(self) -> None:
         """A fresh iSAM2, linearized at the estimate as after loading; the estimate stays."""
@@ -228,7 +220,7 @@ class WindowSmoother:
 
     def _present_factors(self) -> gtsam.NonlinearFactorGraph:
         """As :meth:`_whole`, the very factors that iSAM2 holds."""
-        links = [link for epoch in self._epochs for link in epoch.links or ()]
+        links = [link for epoch in self.epochs for link in epoch.links or ()]
         twists = [twist.index for twist in self.twists.values()]
         held, graph = self.isam.getFactorsUnsafe(), gtsam.NonlinearFactorGraph()
         for index in [self.past_id, *links, *self.ids.values(), *twists]:
@@ -238,9 +230,9 @@ class WindowSmoother:
     def _whole(self) -> gtsam.NonlinearFactorGraph:
         """Every factor of the window: the past, the walks, the pairs, the twists."""
         graph = gtsam.NonlinearFactorGraph()
-        keys = self.keys(self._epochs[0].number, self.past.point.tracks)
+        keys = self.keys(self.epochs[0].number, self.past.point.tracks)
         graph.add(self.observed.without_held().factor(keys))
-        for old, new in pairwise(self._epochs):
+        for old, new in pairwise(self.epochs):
             for factor in self.drift_factors(old, new):
                 graph.add(factor)
         for scan in self.ids:
@@ -257,20 +249,13 @@ class WindowSmoother:
         whole = self._whole() if graph is None else graph
         return isam, list(isam.update(whole, values).getNewFactorsIndices())
 
-    def _held_at(self, point: Point) -> gtsam.NonlinearFactorGraph:
-        """The prior's information, with its mean at a point."""
-        graph, n = gtsam.NonlinearFactorGraph(), point.size
-        centred = Gaussian(point, self.prior.information, np.zeros(n))
-        graph.add(centred.factor(self.keys(0, point.tracks)))
-        return graph
-
     def _replace_isam(self, isam: gtsam.ISAM2, indices: Sequence[int]) -> None:
         """Go on with an iSAM2 of :meth:`_whole` and its factors' indices."""
         new = iter(indices)
         self.isam, self.past_id = isam, next(new)
-        first, *others = self._epochs
+        first, *others = self.epochs
         linked = (replace(epoch, links=(next(new), next(new))) for epoch in others)
-        self._epochs = (replace(first, links=None), *linked)
+        self.epochs = (replace(first, links=None), *linked)
         self.ids = {scan: next(new) for scan in self.ids}
         self.twists = {image: replace(twist, index=next(new)) for image, twist in self.twists.items()}
 
@@ -305,7 +290,7 @@ class WindowSmoother:
     def vector(self) -> FloatArray:
         """(n,) negative gradient of the cost of past and window by the last epoch, at the estimate, over the
         unknowns of ``past`` and what it holds."""
-        return self._with_pairs(self.observed.at(self._point), self.entries).vector
+        return self._with_pairs(self.observed.at(self.point), self.entries).vector
 
     def window_with(self, found: Mapping[int, MatchedPair], point: Point) -> Gaussian:
         """Past and window by the last epoch, about a point at which all scans were matched again, with the
@@ -320,7 +305,7 @@ class WindowSmoother:
     def _with_pairs(self, past: Gaussian, pairs: Mapping[int, MatchedPair]) -> Gaussian:
         """A past and pairs, by scan, on the last epoch, about the past's point."""
         total, numbers = past, {scan: self._epoch_of(scan, pair) for scan, pair in pairs.items()}
-        for i, epoch in enumerate(self._epochs):
+        for i, epoch in enumerate(self.epochs):
             if i > 0:
                 total = total.drifted(self.walk(self._seconds(i)))
             seen = [pair.linear.information for scan, pair in pairs.items() if numbers[scan] == epoch.number]
@@ -331,8 +316,8 @@ class WindowSmoother:
         """Number of the epoch of a pair, which need not be in the graph."""
         if scan in self.entries:
             return self.entries[scan].epoch
-        begun = [epoch.number for epoch in self._epochs if epoch.start_ns <= pair.stamp_ns]
-        return max(begun, default=self._epochs[0].number)
+        begun = [epoch.number for epoch in self.epochs if epoch.start_ns <= pair.stamp_ns]
+        return max(begun, default=self.epochs[0].number)
 
     def static_information(self) -> FloatArray | None:
         """(n, n) the same by static objects alone; None where no match is of a dynamic one."""
@@ -345,7 +330,7 @@ class WindowSmoother:
     def _last_epoch(self, past: Gaussian, window: Mapping[int, Gaussian]) -> FloatArray:
         """(n, n) information of a past and a window, by scan, on the last epoch."""
         total = past
-        for i, epoch in enumerate(self._epochs):
+        for i, epoch in enumerate(self.epochs):
             if i > 0:
                 total = total.drifted(self.walk(self._seconds(i)))
             seen = [window[scan] for scan, e in self.entries.items() if e.epoch == epoch.number]
@@ -354,25 +339,24 @@ class WindowSmoother:
 
     def _seconds(self, i: int) -> float:
         """From the start of epoch i - 1 to that of epoch i [s]."""
-        return max(1e-3, (self._epochs[i].start_ns - self._epochs[i - 1].start_ns) * 1e-9)
+        return max(1e-3, (self.epochs[i].start_ns - self.epochs[i - 1].start_ns) * 1e-9)
 
-    def covariance(self, information: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+    def covariance(self, information: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(n, n) cluster-robust covariance of the unknowns of ``past``, and that of independent matches.
 
         Args:
-            information: of :meth:`information`; None to compute it here.
+            information: of :meth:`information`.
 
         Raises:
             EstimationError: a direction without any information.
         """
         n = self.past.point.size
-        information = (self.information() if information is None else information)[:n, :n]
-        naive = inverted(information)
+        naive = inverted(information[:n, :n])
         robust = naive + naive @ self.excess() @ naive
         spread = None
         if not self.drift.enabled:
             found = [e.linear.objects for e in self.entries.values() if e.linear.objects is not None]
-            spread = self.sums.objects.spread(found, naive, self.past.at(self._point).point)
+            spread = self.sums.objects.spread(found, naive, self.past.at(self.point).point)
         robust = composed(robust, spread, self.weight_curvature_ratio)
         return 0.5 * (robust + robust.T), naive
 
@@ -402,7 +386,7 @@ class WindowSmoother:
     def live_epochs(self) -> list[RetiredEpoch]:
         """Epochs of the window, as if they retired now."""
         found = []
-        for i, epoch in enumerate(self._epochs):
+        for i, epoch in enumerate(self.epochs):
             sums = self.epoch_sums.copy() if i == 0 else EpochSums.empty(self.past.point)
             for scan, entry in self.entries.items():
                 if entry.epoch == epoch.number:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import deque
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import gtsam
 import numpy as np
@@ -26,6 +26,23 @@ FloatArray = NDArray[np.float64]
 
 OBJECT_MEMORY = 50
 """Scans after which an object that was not seen again is another one."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Stretch:
+    """Some scans of the window that are solved as the batch does.
+
+    Attributes:
+        drive: with their images and motions.
+        tracks: of their objects, by the scan's position.
+        dynamic: those that move.
+        at_end: all that there is: an estimate from them is reviewed after it.
+    """
+
+    drive: Drive
+    tracks: Mapping[ObjectId, int]
+    dynamic: Mapping[ObjectId, DynamicObject]
+    at_end: bool = False
 
 
 class Window:
@@ -156,12 +173,14 @@ class Window:
         lost = [(c, name, round(10.0 * (1.0 - w))) for (c, name), w in zip(found, weights, strict=True)]
         return frozenset(entry for entry in lost if entry[2] > 0)
 
-    def latest(self, most: int) -> tuple[Drive, list[int]]:
-        """The last scans as a drive, and their numbers."""
+    def latest(self, most: int) -> tuple[Stretch, list[int]]:
+        """The last scans, where edges are aligned with their objects; and the scans' numbers."""
         drive, numbers = self.drive()
         scans, numbers = drive.scans[-most:], numbers[-most:]
         motions = tuple(m for m in drive.lidar_motions if m.from_ns >= scans[0].stamp_ns)
-        return dataclasses.replace(drive, scans=scans, lidar_motions=motions), numbers
+        part = dataclasses.replace(drive, scans=scans, lidar_motions=motions)
+        objects = self.objects_of(numbers) if self.edges else ({}, {})
+        return Stretch(part, *objects), numbers
 
     def objects_of(self, numbers: Sequence[int]) -> tuple[dict[ObjectId, int], dict[ObjectId, DynamicObject]]:
         """Tracks of the objects of some scans, and the dynamic ones, by the scan's position."""
