@@ -19,7 +19,10 @@ _MEMORY_S = 0.6
 _MAX_DISTANCE_M = 0.15
 """Farthest that points of a static object lie from those of the older scan [m]."""
 _MIN_SHARE = 0.75
-"""Part of an object's points that have to lie within it."""
+"""Part of an object's points that have to lie within it, ..."""
+_MAX_MISSING_M = 1.1
+"""... and more of a long object's: what is missing is no longer than this of one evenly covered, a quarter of
+a car. A tram drives along itself, and nearly all of it is where another part of it was [m]."""
 _CELL_M = 0.4
 """Objects are separate where this much of the ground between them is empty [m]."""
 _VOXEL_M = 0.15
@@ -68,7 +71,19 @@ def on_static_objects(
     near = np.isfinite(distance).astype(np.float64)
     total = np.bincount(labels[keys], minlength=labels.max() + 1)
     share = np.bincount(labels[keys], near, labels.max() + 1) / np.maximum(total, 1)
-    return np.asarray((share >= _MIN_SHARE)[labels])
+    needed = np.maximum(_MIN_SHARE, 1.0 - _MAX_MISSING_M / np.maximum(_lengths(wPs, labels), 1e-9))
+    return np.asarray((share >= needed)[labels])
+
+
+def _lengths(wPs: FloatArray, labels: NDArray[np.intp]) -> FloatArray:
+    """Diagonal of each object's ground plan [m]; ``labels`` (n,) are those of its points."""
+    spans = []
+    for column in wPs[:, :2].T:
+        low, high = (np.full(labels.max() + 1, sign * np.inf) for sign in (1.0, -1.0))
+        np.minimum.at(low, labels, column)
+        np.maximum.at(high, labels, column)
+        spans.append(np.where(high >= low, high - low, 0.0))
+    return np.hypot(*spans)
 
 
 def _voxel_representatives(points: FloatArray, voxel_m: float) -> NDArray[np.intp]:

@@ -208,6 +208,19 @@ def test_static_objects_are_distinguished_from_dynamic_ones() -> None:
     assert not static[1200:].any()
 
 
+@pytest.mark.parametrize(("step_m", "static"), [(0.0, True), (0.8, False)])
+def test_a_tram_that_drives_along_itself_is_not_static(step_m: float, static: bool) -> None:
+    """5 m on, 27 of its 32 m are where another part of it was."""
+    memory = StaticPoints()
+    x, z = np.meshgrid(np.arange(0.0, 32.0, 0.1), np.arange(0.3, 3.0, 0.2))
+    side = np.column_stack([x.ravel(), np.full(x.size, -3.0), z.ravel()])
+    for k in range(8):
+        points = side + np.array([k * step_m, 0.0, 0.0])
+        found = memory.find(points, k * PERIOD_NS)
+        memory.insert(points, k * PERIOD_NS)
+    assert (found == static).all()
+
+
 def test_a_moving_truck_does_not_pull_the_motion() -> None:
     poses = path(3.0, 0.0, 10)
     scans = []
