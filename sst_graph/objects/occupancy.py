@@ -18,7 +18,6 @@ from functools import cached_property
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial import cKDTree
 
 from sst_graph.drive.preparation import ScanFeatures
@@ -47,8 +46,8 @@ _MAX_INSIDE = 1000
 _DIRECTIONS = 240
 _EDGE_WIDTH = 2.0 * np.pi / (_DIRECTIONS - 1)
 """Side points of an object within so many radians are one upright edge."""
-_MIN_EDGE_POINTS = 4
-"""Fewest points of an edge whose places are occupied or free."""
+_MAX_EDGE_POINTS, _MIN_EDGE_POINTS = 8, 4
+"""Most points of an edge that are looked up, and fewest whose places are occupied or free."""
 _SIGHT_BIN = np.radians(1.0)
 """Directions that are looked up together [rad]."""
 _BEHIND_M = 0.5
@@ -173,8 +172,9 @@ class _Places:
             names += [(c, int(n)) for n in np.unique(objects)]
             chosen = _some_of_each(objects, _MAX_POINTS)
             outlines[c] = _Outlines.of(lPs[chosen], objects[chosen], wTl)
-            chosen, which = _upright_edges(scan.boundaries[c])
-            upright[c] = _Outlines.of(scan.boundaries[c].lPs[chosen], which, wTl)
+            sides, which = _upright_edges(scan.boundaries[c])
+            some = _some_of_each(which, _MAX_EDGE_POINTS)
+            upright[c] = _Outlines.of(scan.boundaries[c].lPs[sides[some]], which[some], wTl)
             inside = scan.lPs[scan.classes == c]
             thin = inside[:: max(1, len(inside) // _MAX_INSIDE)]
             trees[c] = _tree(_moved(wTl, np.concatenate([lPs, thin])))
@@ -208,10 +208,11 @@ class _Places:
             if not len(upright.owners):
                 continue
             near = upright.near(other.trees[c]) if c in other.trees else np.zeros(len(upright.wPs), bool)
-            if other._anything is not None:
-                near[~near] = upright.take(~near).near(other._anything)
             free = ~near
             free[free] = other._sees_through(upright.wPs[free])
+            if free.any() and other._anything is not None:
+                near[free] = upright.take(free).near(other._anything)
+                free &= ~near
             owners, which = np.unique(upright.owners, return_inverse=True)
             known = np.bincount(which, near | free)
             shares, enough = np.bincount(which, free) / np.maximum(known, 1.0), known >= _MIN_EDGE_POINTS
@@ -222,36 +223,38 @@ class _Places:
 
     @cached_property
     def _sight(self) -> tuple[FloatArray, FloatArray]:
-        """Ranges of the nearest raised and of the farthest point about each direction [m]: inf and 0 where
-        there is none."""
-        lPs, raised = self.scan.lPs, _RAISED[self.scan.classes]
-        cells, ranges = _directions(lPs)
+        """Ranges of the nearest raised and of the farthest point in each direction [m]: inf and 0 where there
+        is none."""
+        raised = _RAISED[self.scan.classes]
+        rows, columns, ranges = _directions(self.scan.lPs)
         nearest, farthest = np.full(_SIGHT, np.inf), np.zeros(_SIGHT)
-        np.minimum.at(nearest.reshape(-1), cells[raised], ranges[raised])
-        np.maximum.at(farthest.reshape(-1), cells, ranges)
-        mode = ("nearest", "wrap")
-        return minimum_filter(nearest, 3, mode=mode), maximum_filter(farthest, 3, mode=mode)
+        np.minimum.at(nearest, (rows[raised], columns[raised]), ranges[raised])
+        np.maximum.at(farthest, (rows, columns), ranges)
+        return nearest, farthest
 
     def _sees_through(self, wPs: FloatArray) -> NDArray[np.bool_]:
         """(n,) whether rays about these places go on behind them, and none ends before them."""
         lPs = (wPs - self.wTl.translation()) @ self.wTl.rotation().matrix()
-        cells, ranges = _directions(lPs)
-        nearest, farthest = (about.reshape(-1)[cells] for about in self._sight)
-        return np.asarray((nearest > ranges - _BEHIND_M) & (farthest > ranges + _BEHIND_M))
+        rows, columns, ranges = _directions(lPs)
+        around = np.arange(-1, 2)
+        near_rows = np.clip(rows[:, None, None] + around[:, None], 0, _SIGHT[0] - 1)
+        near_columns = (columns[:, None, None] + around) % _SIGHT[1]
+        nearest, farthest = (about[near_rows, near_columns] for about in self._sight)
+        behind = farthest.max(axis=(1, 2)) > ranges + _BEHIND_M
+        return np.asarray(behind & (nearest.min(axis=(1, 2)) > ranges - _BEHIND_M))
 
 
 _SIGHT = (round(np.pi / _SIGHT_BIN), round(2.0 * np.pi / _SIGHT_BIN))
 """Cells of elevation and azimuth."""
 
 
-def _directions(lPs: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
-    """Cell of each point's direction (n,), and its range [m]."""
+def _directions(lPs: FloatArray) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
+    """Cells of elevation and azimuth of points (n, 3), and their ranges [m]."""
     x, y, z = lPs.T
     across = np.hypot(x, y)
     rows = ((np.arctan2(z, across) + 0.5 * np.pi) / _SIGHT_BIN).astype(np.intp)
     columns = ((np.arctan2(y, x) + np.pi) / _SIGHT_BIN).astype(np.intp)
-    cells = np.minimum(rows, _SIGHT[0] - 1) * _SIGHT[1] + np.minimum(columns, _SIGHT[1] - 1)
-    return cells, np.hypot(across, z)
+    return np.minimum(rows, _SIGHT[0] - 1), np.minimum(columns, _SIGHT[1] - 1), np.hypot(across, z)
 
 
 def _upright_edges(boundaries: Boundaries) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -301,4 +304,4 @@ def _some_of_each(objects: NDArray[np.intp], most: int) -> NDArray[np.intp]:
     """Positions of at most ``most`` evenly spread entries of each number."""
     order = np.argsort(objects, kind="stable")
     parts = np.split(order, np.flatnonzero(np.diff(objects[order])) + 1)
-    return np.concatenate([part[:: -(-len(part) // most)] for part in parts if len(part)])
+    return np.concatenate([order[:0], *(part[:: -(-len(part) // most)] for part in parts if len(part))])
