@@ -31,6 +31,19 @@ def drives(kitti_drive: Path, tmp_path: Path) -> Path:
     return folder
 
 
+def test_a_drive_in_the_place_of_a_folder_of_drives_is_told(
+    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What stands in it is no drive; without the note its errors name folders that were never given."""
+    drive = drives / "v1_2026-03-01"
+    command = ["batch", str(drive), "--out", str(tmp_path / "out"), "--workers", "1"]
+    assert main(command) == 3
+    told = capsys.readouterr().err
+    assert f"note: {drive} looks like one drive (kitti); what stands in it (sequences) is taken for" in told
+    assert main(["batch", str(drives), "--out", str(tmp_path / "other"), "--vehicle-from", "x(y)"]) == 2
+    assert "looks like one drive" not in capsys.readouterr().err
+
+
 def rows_of(out: Path) -> dict[str, dict[str, str]]:
     with (out / "summary.csv").open(newline="") as stream:
         return {row["drive"]: row for row in csv.DictReader(stream)}

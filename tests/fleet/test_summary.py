@@ -142,6 +142,37 @@ def test_reasons_that_drives_share_are_counted_together(tmp_path: Path) -> None:
     assert "0 of 4 drives are ok; 0 have no result" in page
 
 
+def test_a_contradiction_is_no_other_reason(tmp_path: Path) -> None:
+    """What a drive says of itself is counted with others that say the same; that it contradicts, apart."""
+    drives = [drive(f"x{k}", "v") for k in range(6)]
+    records = {
+        one.name: done(one.name, result(k, "unobservable", 0.03 * (k == 2))) for k, one in enumerate(drives)
+    }
+    long = (
+        "the time offset is known to 340.2 ms only: record motion, several frames at some speed, with a " * 2
+    )
+    records |= {name: replace(record, reason=long + "turn") for name, record in records.items()}
+    write_summary(drives, records, Place.of(tmp_path), BatchConfig())
+    page = (tmp_path / "summary.html").read_text()
+    assert "<li>1 × contradicts the other drives of its vehicle</li>" in page
+    (kind,) = re.findall(r"<li>6 × unobservable: ([^<]*)</li>", page)
+    assert kind.endswith(" motion…") and long.replace("340.2", "…").startswith(kind[:-1])
+    # The drives that count and those that do not are all there are.
+    assert re.search(r'<td class="num">5</td><td class="num">1</td>', page)
+
+
+def test_a_drift_is_not_drawn_across_a_change(
+    batch: tuple[list[Drive], dict[str, Record]], tmp_path: Path
+) -> None:
+    drives, records = batch
+    write_summary(drives, records, Place.of(tmp_path), BatchConfig())
+    page = (tmp_path / "summary.html").read_text()
+    rotation = page[page.index("Rotation") :].split("</svg></figure>")[0].split("Translation")[0]
+    # Three axes, each drawn before the change and after it.
+    assert len(re.findall('class="line [abc]"', rotation)) == 6
+    assert len(re.findall('class="band [abc]"', rotation)) == 6
+
+
 def test_all_fine(tmp_path: Path) -> None:
     drives = [drive("x", "v"), drive("y", "v")]
     records = {name: done(name, result(k)) for k, name in enumerate("xy")}

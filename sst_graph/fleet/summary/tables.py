@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -72,6 +73,12 @@ def drive_rows(
         size = 0.0 if sigmas is None else float(np.max(sigmas / np.array([0.1] * 3 + [1.0] * 3 + [1.0])))
         rows.append(((rank, -size, drive.name), row))  # type: ignore[arg-type]
     return [row for _, row in sorted(rows, key=lambda one: one[0])]
+
+
+def own_reason(row: Row) -> str:
+    """The reason of a drive's own result, without that it contradicts others."""
+    vehicle = re.escape(str(row["vehicle"]))
+    return re.sub(rf"^contradicts the other drives of {vehicle}: [^;]*(?:; |$)", "", str(row["reason"]))
 
 
 def vehicle_rows(vehicles: Sequence[Vehicle]) -> list[Row]:

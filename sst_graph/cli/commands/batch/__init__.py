@@ -15,6 +15,7 @@ from sst_graph.cli.inputs import calibration_settings
 from sst_graph.cli.messages import complain, mention
 from sst_graph.cli.options import SOURCE_DEFAULTS
 from sst_graph.cli.reading import check_options
+from sst_graph.data.source import recognized
 from sst_graph.errors import ConfigError, count_of
 from sst_graph.fleet import (
     BatchConfig,
@@ -40,6 +41,7 @@ def run(args: argparse.Namespace) -> int:
     config = _config(args)
     _check_passed_on(args)
     drives = find_drives(args.drives, _at_least("--name-parts", args.name_parts, 1))
+    _say_if_a_drive(args.drives, drives)
     if args.vehicle_from is not None:
         drives = with_vehicles(drives, args.vehicle_from)
         _say_without_vehicle(drives)
@@ -125,6 +127,17 @@ def _check_apart(drives: list[Drive], out: Place) -> None:
             raise ConfigError(
                 f"--out {out}: found the drive {drive.place} in it or around it, expected two places"
             )
+
+
+def _say_if_a_drive(what: str, drives: list[Drive]) -> None:
+    """Tell who gives one drive in the place of a folder of drives."""
+    place = Place.of(what)
+    if place.is_local and place.is_folder() and (kind := recognized(place.path)) is not None:
+        parts = ", ".join(drive.place.name for drive in drives[:3]) + (", ..." if len(drives) > 3 else "")
+        complain(
+            f"note: {what} looks like one drive ({kind}); what stands in it ({parts}) is taken for the "
+            "drives: name the folder above, or a pattern such as 'drives/*'"
+        )
 
 
 def _say_without_vehicle(drives: list[Drive]) -> None:
