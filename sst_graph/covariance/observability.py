@@ -209,7 +209,8 @@ def _alone(covariance: FloatArray, step: FloatArray) -> FloatArray:
         length = float(np.linalg.norm(step[own]))
         if length > 0.0:
             direction = step[own] / length
-            found[own] = direction * np.sqrt(max(direction @ covariance[own, own] @ direction, 0.0))
+            variance = float(direction @ covariance[own, own] @ direction)
+            found[own] = direction * max(variance, 0.0) ** 0.5
     return found
 
 

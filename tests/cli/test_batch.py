@@ -44,6 +44,21 @@ def test_a_drive_in_the_place_of_a_folder_of_drives_is_told(
     assert "looks like one drive" not in capsys.readouterr().err
 
 
+def test_a_batch_in_the_folder_of_its_drives_goes_on(
+    drives: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its own folder is no drive, when the same command is given again."""
+    for name in ("v1_2026-03-01", "v1_2026-03-08", "v2_2026-03-01"):
+        shutil.rmtree(drives / name)
+    command = ["batch", str(drives), "--out", str(drives / "out"), "--workers", "1"]
+    for _ in range(2):
+        assert main(command) == 3
+        assert "1: 1 bad_input" in capsys.readouterr().out
+    shutil.rmtree(drives / "v2_2026-03-08")
+    assert main(command) == 2
+    assert "found no drive beside this folder of the batch" in capsys.readouterr().err
+
+
 def rows_of(out: Path) -> dict[str, dict[str, str]]:
     with (out / "summary.csv").open(newline="") as stream:
         return {row["drive"]: row for row in csv.DictReader(stream)}

@@ -161,6 +161,36 @@ def test_a_contradiction_is_no_other_reason(tmp_path: Path) -> None:
     assert re.search(r'<td class="num">5</td><td class="num">1</td>', page)
 
 
+def test_a_vehicle_whose_drives_all_leave_a_direction_open_is_unobservable(tmp_path: Path) -> None:
+    """Each drive is, too; where they see different directions, the vehicle is ok."""
+    drives = [drive("x", "v"), drive("y", "v")]
+
+    def outcome(*wide: int) -> tuple[str, str]:
+        records = {}
+        for one, axis in zip(drives, wide, strict=True):
+            found = result(1, "unobservable")
+            covariance = np.array(found.covariance)
+            covariance[axis, axis] = 0.3**2
+            records[one.name] = done(one.name, replace(found, covariance=covariance))
+        (vehicle,) = write_summary(drives, records, Place.of(tmp_path), BatchConfig()).vehicles
+        return vehicle.status, vehicle.reason
+
+    status, reason = outcome(6, 6)
+    assert status == "unobservable" and reason.startswith("by all drives, the time offset is known to 2")
+    assert "1 of 1 vehicle needs attention" in (tmp_path / "summary.html").read_text()
+    assert outcome(6, 3) == ("ok", "")
+
+
+def test_drives_of_earlier_runs_that_are_not_given_are_told(tmp_path: Path) -> None:
+    for name in ("x", "y", "z"):
+        (tmp_path / "drives" / name).mkdir(parents=True)
+    records = {"x": done("x", result(0))}
+    outcome = write_summary([drive("x")], records, Place.of(tmp_path), BatchConfig())
+    assert outcome.others == 2
+    page = (tmp_path / "summary.html").read_text()
+    assert "2 drives of earlier runs were not given this time: they are in no table and in no vehicle" in page
+
+
 def test_a_drift_is_not_drawn_across_a_change(
     batch: tuple[list[Drive], dict[str, Record]], tmp_path: Path
 ) -> None:

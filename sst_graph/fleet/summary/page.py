@@ -28,17 +28,21 @@ _SIGMA_HEADS = ("σ rotation", "σ translation", "σ time offset")
 _SHOWN = ("drive", "vehicle", "date", "status", "reason", *_SIGMA_HEADS, "took")
 
 
-def summary_html(rows: Sequence[Row], vehicle_rows: Sequence[Row], vehicles: Sequence[Vehicle]) -> str:
+def summary_html(
+    rows: Sequence[Row], vehicle_rows: Sequence[Row], vehicles: Sequence[Vehicle], others: int = 0
+) -> str:
     """The page.
 
     Args:
         rows: of the drives, in the order of the page.
         vehicle_rows: of the vehicles, in the order of the page.
         vehicles: all of them.
+        others: how many drives of earlier runs were not given this time.
     """
     by_name = {one.name: one for one in vehicles}
     body = [
         _verdict(rows, vehicle_rows),
+        paragraph(others_line(others), "note") if others else "",
         _vehicles(vehicle_rows),
         _drifts([by_name[str(row["vehicle"])] for row in vehicle_rows]),
         _drives(rows),
@@ -62,6 +66,16 @@ def counts_line(rows: Sequence[Row]) -> str:
     """How many drives there are of each status."""
     counts = Counter(str(row["status"]) for row in rows)
     return ", ".join(f"{count} {name}" for name, count in counts.most_common())
+
+
+def others_line(others: int) -> str:
+    """That results of drives that were not given this time count for nothing."""
+    them = _verb(others, "it is", "they are")
+    return (
+        f"{count_of(others, 'drive')} of earlier runs {_verb(others, 'was', 'were')} not given this time: "
+        f"{them} in no table and in no vehicle. Give all drives to have them in; those that are done are not "
+        "run again."
+    )
 
 
 def _verdict(rows: Sequence[Row], vehicle_rows: Sequence[Row]) -> str:

@@ -83,7 +83,7 @@ def own_reason(row: Row) -> str:
 
 def vehicle_rows(vehicles: Sequence[Vehicle]) -> list[Row]:
     """A row a vehicle, what needs attention first."""
-    order = ("changed", "contradicted", "no_result", "ok")
+    order = ("changed", "contradicted", "no_result", "unobservable", "ok")
     rows: list[Row] = []
     for one in sorted(vehicles, key=lambda each: (order.index(each.status), each.name)):
         now = one.calibration

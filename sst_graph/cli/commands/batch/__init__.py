@@ -30,7 +30,7 @@ from sst_graph.fleet import (
     with_vehicles,
     write_summary,
 )
-from sst_graph.fleet.summary.page import counts_line
+from sst_graph.fleet.summary.page import counts_line, others_line
 from sst_graph.reference import load_initial
 
 _MOST_SAID = 10
@@ -40,13 +40,13 @@ def run(args: argparse.Namespace) -> int:
     """Calibrate all drives that are not done yet, and write the summary of all."""
     config = _config(args)
     _check_passed_on(args)
-    drives = find_drives(args.drives, _at_least("--name-parts", args.name_parts, 1))
+    out = Place.of(args.out)
+    out = Place(os.path.abspath(out.url)) if out.is_local else out
+    drives = _but(out, find_drives(args.drives, _at_least("--name-parts", args.name_parts, 1)))
     _say_if_a_drive(args.drives, drives)
     if args.vehicle_from is not None:
         drives = with_vehicles(drives, args.vehicle_from)
         _say_without_vehicle(drives)
-    out = Place.of(args.out)
-    out = Place(os.path.abspath(out.url)) if out.is_local else out
     _check_apart(drives, out)
     with open_batch(out, config.options), children_ended(), ProgressOnStderr() as told:
         records = run_batch(drives, out, config, told)
@@ -70,6 +70,7 @@ def _config(args: argparse.Namespace) -> BatchConfig:
         ),
         retries=_at_least("--retries", args.retries, 0),
         walk=_walk(args),
+        observability=calibration_settings(args).observability,
     )
 
 
@@ -107,11 +108,21 @@ def _passed_on(args: argparse.Namespace) -> tuple[str, ...]:
 
 
 def _check_passed_on(args: argparse.Namespace) -> None:
-    """Refuse at once what every drive would refuse."""
-    calibration_settings(args)
+    """Refuse at once what every drive would refuse; the settings are checked by now."""
     check_options(args)
     if args.init not in ("dataset", "none"):
         load_initial(Path(args.init), args.camera or str(SOURCE_DEFAULTS["camera"]))
+
+
+def _but(out: Place, drives: list[Drive]) -> list[Drive]:
+    """The drives without the batch's own folder, which may stand among them."""
+    if not out.is_local:
+        return drives
+    own = os.path.realpath(out.url)
+    left = [one for one in drives if not one.place.is_local or os.path.realpath(one.place.url) != own]
+    if not left:
+        raise ConfigError(f"{out}: found no drive beside this folder of the batch, expected at least one")
+    return left
 
 
 def _check_apart(drives: list[Drive], out: Place) -> None:
@@ -156,6 +167,8 @@ def _say(outcome: Outcome, out: Place) -> None:
         mention(f"{'':<15} and {len(wrong) - _MOST_SAID} more without result")
     for vehicle in [one for one in outcome.vehicles if one.status != "ok"][:_MOST_SAID]:
         mention(f"{'vehicle':<15} {vehicle.name}: {vehicle.reason}")
+    if outcome.others:
+        complain(f"note: {others_line(outcome.others)}")
     if "summary.parquet" not in outcome.names:
         complain("note: no Parquet without pyarrow: pip install 'sst-graph[fleet]'")
     mention(f"{'wrote':<15} {out}: {', '.join(outcome.names)}")
