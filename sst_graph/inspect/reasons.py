@@ -42,6 +42,12 @@ def as_sentence(reason: str) -> str:
     return reason if reason.endswith("…") else f"{reason}."
 
 
+def capitalized(text: str) -> str:
+    """With a capital at its beginning; a name that stands there before a colon stays as it is."""
+    first = text.split(" ", 1)[0]
+    return text if first.endswith(":") else text[:1].upper() + text[1:]
+
+
 def cut(text: str, most: int) -> str:
     """A text of so many letters at most, ended at a word where it is longer."""
     if len(text) <= most:
