@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from hashlib import sha256
 from pathlib import Path
 
 from sst_graph.config import Settings, setting
@@ -34,6 +35,7 @@ from sst_graph.fleet.summary.tables import Row, csv_bytes, drive_rows, parquet_b
 from sst_graph.fleet.vehicles.fused import Vehicle, vehicle_json, vehicles_of
 from sst_graph.fleet.vehicles.walk import WalkConfig
 from sst_graph.result import result_file
+from sst_graph.segmentation.model_files import model_files
 
 BATCH = "batch.json"
 FORMAT = "sst-graph/batch"
@@ -41,7 +43,7 @@ VERSION = 1
 LOCK = ".sst-graph-batch.lock"
 VEHICLES = "vehicles"
 
-_NAME_FILES = ("--config", "--init", "--image-model", "--lidar-model")
+_NAME_FILES, _NAME_NETWORKS = ("--config", "--init"), ("--image-model", "--lidar-model")
 _OPTION_FILE = FileKind("a file that an option names", 2**36)
 
 Told = Callable[["Progress"], None]
@@ -164,13 +166,18 @@ def open_batch(out: Place, options: Sequence[str]) -> Iterator[None]:
 
 
 def _digests(options: Sequence[str]) -> dict[str, str]:
-    """SHA-256 of the files that options name, by option."""
+    """SHA-256 of the files that options name, by option; of a network also of its own files."""
     found = {}
     for option in options:
         name, _, value = option.partition("=")
-        path = result_file(Path(value))
-        if name in _NAME_FILES and path.is_file():
-            found[option] = digest_of_file(path, _OPTION_FILE).hex()
+        if name in _NAME_NETWORKS:
+            files: Sequence[Path] = model_files(value)
+        else:
+            path = result_file(Path(value))
+            files = [path] if name in _NAME_FILES and path.is_file() else []
+        if files:
+            digests = [digest_of_file(path, _OPTION_FILE) for path in files]
+            found[option] = (digests[0] if len(files) == 1 else sha256(b"".join(digests)).digest()).hex()
     return found
 
 

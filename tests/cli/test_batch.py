@@ -300,6 +300,32 @@ def test_a_file_of_the_options_is_the_same_to_the_end(
     assert f"was begun with other contents of --config={tmp_path}/settings.json" in said
 
 
+@pytest.mark.parametrize(
+    ("option", "named", "changed"),
+    [
+        ("--image-model", "net.yaml", "net.onnx"),
+        ("--image-model", "net.onnx", "net.onnx.data"),
+        ("--lidar-model", ".", "data_cfg.yaml"),
+    ],
+)
+def test_a_network_of_the_options_is_the_same_to_the_end(
+    drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], option: str, named: str, changed: str
+) -> None:
+    """Its weights, beside what describes it, or a file of its folder: labels would be of two networks."""
+    nets = tmp_path / "nets"
+    nets.mkdir()
+    (nets / "net.yaml").write_text("network: net.onnx\nclasses: coco\n")
+    for name in ("net.onnx", "net.onnx.data", "data_cfg.yaml"):
+        (nets / name).write_text("1")
+    command = ["batch", str(drives / "v2_*-08"), "--out", str(tmp_path / "out"), "--retries", "0"]
+    command += [option, str(nets / named)]
+    assert main(command) == 3 == main(command)
+    (nets / changed).write_text("2")
+    capfd.readouterr()
+    assert main(command) == 2
+    assert f"was begun with other contents of {option}={nets / named}" in capfd.readouterr().err
+
+
 def test_two_batches_do_not_meet(drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     from sst_graph.fleet import open_batch
 
