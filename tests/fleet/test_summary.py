@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from fleet.vehicle_drives import RIG, SIGMAS
 
+from sst_graph import report
 from sst_graph.errors import DataError
 from sst_graph.export import fuse_marginals, marginal_of_result
 from sst_graph.factors import PinholeCamera
@@ -32,6 +33,27 @@ def test_every_status_has_a_colour_and_a_rank() -> None:
     assert sorted(ranks) == list(range(len(ranks)))
     for status in get_args(Status):
         assert re.search(rf"\.s-{status}\b", style), status
+
+
+def _luminance(colour: str) -> float:
+    """Of #rrggbb, as WCAG 2 has it."""
+    values = np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) / 255.0
+    linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+    return float(linear @ (0.2126, 0.7152, 0.0722))
+
+
+def test_a_status_can_be_read_on_its_colour_in_light_and_dark() -> None:
+    own = (Path(summary_page.__file__).parent / "page.css").read_text()
+    shared = (Path(report.__file__).parent / "page.css").read_text()
+    (text,) = re.findall(r"\.tag \{[^}]*[ ;]color: var\(--(\w+)\)", own)
+    grounds = set(re.findall(r"background: var\(--(\w+)\); \}", own)) - {"panel"}
+    light = dict(re.findall(r"--(\w+): (#\w{6})", shared.split("@media")[0]))
+    dark = light | dict(re.findall(r"--(\w+): (#\w{6})", shared.split("@media")[1]))
+    assert len(grounds) == 4 and light["back"] != dark["back"]
+    for colours in (light, dark):
+        for ground in grounds:
+            high, low = sorted((_luminance(colours[text]), _luminance(colours[ground])), reverse=True)
+            assert (high + 0.05) / (low + 0.05) > 4.3, ground
 
 
 CAMERA = PinholeCamera(700.0, 700.0, 600.0, 180.0, 1242, 375)
