@@ -24,6 +24,7 @@ from sst_graph.fleet.record import Cost, Numbers, Status
 from sst_graph.fleet.summary import page as summary_page
 from sst_graph.fleet.vehicles.fused import vehicle_of
 from sst_graph.fleet.vehicles.walk import WalkConfig
+from sst_graph.reference import read_reference
 from sst_graph.result import CalibrationResult
 
 
@@ -246,6 +247,21 @@ def test_a_contradicting_drive_stands_before_those_that_are_ok(tmp_path: Path) -
     outcome = write_summary(drives, records, Place.of(tmp_path), BatchConfig())
     assert outcome.rows[0]["drive"] == "x2" and outcome.rows[0]["contradicts"] is True
     assert "contradicts the other drives of v" in str(outcome.rows[0]["reason"]) and not outcome.all_fine
+
+
+def test_a_vehicle_is_a_start_and_a_truth(tmp_path: Path) -> None:
+    """``--init`` and ``--truth`` read the calibration of its file."""
+    drives = [drive("x", "v"), drive("y", "v"), drive("z", "w")]
+    named = [replace(result(k), camera_name="image_2") for k in range(2)]
+    records = {name: done(name, found) for name, found in zip("xy", named, strict=True)}
+    (known, _) = write_summary(drives, records, Place.of(tmp_path), BatchConfig()).vehicles
+    found = read_reference(tmp_path / "vehicles/v.json", "image_2")
+    assert known.calibration is not None and found.cTl.equals(known.calibration.cTl, 1e-12)
+    assert found.time_offset_s == pytest.approx(known.calibration.time_offset_s)
+    with pytest.raises(DataError, match=r"a calibration of camera image_2, expected one of image_3"):
+        read_reference(tmp_path / "vehicles/v.json", "image_3")
+    with pytest.raises(DataError, match="a vehicle without a calibration"):
+        read_reference(tmp_path / "vehicles/w.json")
 
 
 def test_what_drives_have_in_common_does_not_average_out() -> None:

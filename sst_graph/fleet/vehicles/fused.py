@@ -18,13 +18,13 @@ from sst_graph.fleet.drives import Drive
 from sst_graph.fleet.record import Numbers, Record
 from sst_graph.fleet.vehicles.changes import Finding, Findings, find_changes
 from sst_graph.fleet.vehicles.walk import DriveEstimate, Smoothed, WalkConfig, smoothed
+from sst_graph.imports.records import VEHICLE_FORMAT
 from sst_graph.result import WeakDirection
 
 FloatArray = NDArray[np.float64]
 VehicleStatus = Literal["ok", "unobservable", "changed", "contradicted", "no_result"]
 
 _LIMITS = ObservabilityConfig()
-FORMAT = "sst-graph/vehicle"
 VERSION = 1
 
 
@@ -180,7 +180,7 @@ def vehicle_json(vehicle: Vehicle, records: Mapping[str, Record], config: WalkCo
     """The text of ``vehicles/NAME.json``."""
     now = vehicle.calibration
     document = {
-        "format": FORMAT,
+        "format": VEHICLE_FORMAT,
         "version": VERSION,
         "vehicle": vehicle.name,
         "status": vehicle.status,
