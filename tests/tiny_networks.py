@@ -19,16 +19,18 @@ def write_network(
     shape: Sequence[int | str],
     outputs: Sequence[tuple[str, int]],
     constants: dict[str, np.ndarray] | None = None,
+    kind: int = TensorProto.FLOAT,
 ) -> Path:
     """A network of nodes (operation, inputs, outputs, attributes) on ``input`` of a shape.
 
     Args:
         outputs: names and types (TensorProto.FLOAT, ...); shapes are left open.
+        kind: type of the input.
     """
     graph = helper.make_graph(
         [helper.make_node(op, ins, outs, **attributes) for op, ins, outs, attributes in nodes],
         "tiny",
-        [helper.make_tensor_value_info("input", TensorProto.FLOAT, list(shape))],
+        [helper.make_tensor_value_info("input", kind, list(shape))],
         [helper.make_tensor_value_info(name, kind, None) for name, kind in outputs],
         [numpy_helper.from_array(value, name) for name, value in (constants or {}).items()],
     )

@@ -263,10 +263,12 @@ def _contradicted(
     """What the data contradict and what else is wrong, the most important first.
 
     A step within a drive looks like an assumption that is broken by a little at all times (a clock that was
-    set, like one that runs fast), and the other way round: the one that explains more is said first.
+    set, like one that runs fast), and the other way round: the one that explains more is said first. Drives
+    of two mounts look like anything, and one estimate for both may not even settle.
     """
     assumptions = contradiction_sentence(tests)
-    if assumptions and contradictions.step_chi2 > tests[0].score ** 2:
+    steps = max(contradictions.step_chi2 if assumptions else 0.0, contradictions.drives_chi2)
+    if steps > (tests[0].score ** 2 if assumptions else 0.0):
         return (*contradictions.sentences, *assumptions, *wrong)
     return (*assumptions, *wrong, *contradictions.sentences)
 

@@ -42,12 +42,14 @@ class Contradictions:
         sentences: one for each contradiction.
         stretches: the stretches, each solved by itself.
         step_chi2: of the longest step within a drive; 0 without one.
+        drives_chi2: of the drive that contradicts the others most; 0 without one.
         diagnostics: JSON-able numbers.
     """
 
     sentences: tuple[str, ...] = ()
     stretches: tuple[SolvedPart, ...] = ()
     step_chi2: float = 0.0
+    drives_chi2: float = 0.0
     diagnostics: dict[str, Any] = field(default_factory=dict)
 
 
@@ -67,17 +69,19 @@ def find_contradictions(parts: PartSolver) -> Contradictions:
     sentences = [_step_sentence(parts, step) for step in steps]
     # 3. Each drive against the others.
     against = _between(parts, stretches)
-    sentences += [
-        _drive_sentence(parts, number, difference)
-        for number, difference in against.items()
-        if difference.p_value * len(against) < false_alarm
-    ]
+    apart = {n: d for n, d in against.items() if d.p_value * len(against) < false_alarm}
+    sentences += [_drive_sentence(parts, number, difference) for number, difference in apart.items()]
     diagnostics = {
         "within": [_step_document(parts, step) for step in steps],
         "between": {parts.drives[n].name: _difference_document(d) for n, d in against.items()},
     }
-    chi2 = max((step.difference.chi2 for step in steps), default=0.0)
-    return Contradictions(tuple(sentences), tuple(s for own in stretches for s in own), chi2, diagnostics)
+    return Contradictions(
+        tuple(sentences),
+        tuple(s for own in stretches for s in own),
+        max((step.difference.chi2 for step in steps), default=0.0),
+        max((difference.chi2 for difference in apart.values()), default=0.0),
+        diagnostics,
+    )
 
 
 def _cut(scans: int) -> list[tuple[int, ...]]:

@@ -194,9 +194,29 @@ def _describe(step: FloatArray, covariance: FloatArray, cTl: gtsam.Pose3, advice
     vector = scaled / sigma
     if vector[np.abs(vector).argmax()] < 0:
         step, vector = -step, -vector
-    c_step = np.concatenate([step[:3], np.asarray(cTl.rotation().matrix()) @ step[3:6], step[6:]])
-    sentence, remedy = _words(c_step, vector, _traded(covariance, step), advice)
+    c_step, c_alone = (_in_camera(one, cTl) for one in (step, _alone(covariance, step)))
+    sentence, remedy = _words((c_step, c_alone), vector, _traded(covariance, step), advice)
     return WeakDirection(vector, sigma, sentence, remedy)
+
+
+def _alone(covariance: FloatArray, step: FloatArray) -> FloatArray:
+    """The rotation, translation and time offset of a step (7,), each as long as one sigma along it.
+
+    A part of a one-sigma step is shorter: it moves with the others.
+    """
+    found = np.zeros(7)
+    for own in (slice(0, 3), slice(3, 6), slice(6, 7)):
+        length = float(np.linalg.norm(step[own]))
+        if length > 0.0:
+            direction = step[own] / length
+            variance = float(direction @ covariance[own, own] @ direction)
+            found[own] = direction * max(variance, 0.0) ** 0.5
+    return found
+
+
+def _in_camera(step: FloatArray, cTl: gtsam.Pose3) -> FloatArray:
+    """A step (7,) with its translation in the camera's axes."""
+    return np.concatenate([step[:3], np.asarray(cTl.rotation().matrix()) @ step[3:6], step[6:]])
 
 
 def _traded(covariance: FloatArray, step: FloatArray) -> bool:
@@ -208,14 +228,18 @@ def _traded(covariance: FloatArray, step: FloatArray) -> bool:
     return bool(abs(along @ covariance @ offset) > _TRADE_CORRELATION * np.sqrt(max(variances, 1e-300)))
 
 
-def _words(step: FloatArray, vector: FloatArray, traded: bool, advice: Advice) -> tuple[str, str]:
+def _words(
+    steps: tuple[FloatArray, FloatArray], vector: FloatArray, traded: bool, advice: Advice
+) -> tuple[str, str]:
     """What one sigma along a weak direction means, and what to record.
 
     Args:
-        step: (7,) along it, with the translation in the camera's axes.
+        steps: (7,) along it, and its parts as long as one sigma of each alone; translations in the camera's
+            axes.
         vector: (7,) the direction in scaled units.
         traded: translation and time offset hardly separate.
     """
+    step, alone = steps
     rotation, c_translation, time_offset_s = step[:3], step[3:6], float(step[6])
     parts = {
         "rotation": float(np.linalg.norm(vector[:3])),
@@ -243,16 +267,18 @@ def _words(step: FloatArray, vector: FloatArray, traded: bool, advice: Advice) -
         )
     if parts["offset"] >= max(parts["rotation"], parts["translation"]):
         return (
-            f"the time offset is known to {abs(time_offset_s) * 1e3:.1f} ms only (one sigma)",
+            f"the time offset is known to {abs(float(alone[6])) * 1e3:.1f} ms only (one sigma)",
             advice.offset,
         )
     if parts["rotation"] > parts["translation"]:
         return (
-            f"the rotation is known to {angle_deg:.2f} deg only (one sigma) about {_rotation_axis(rotation)}",
+            f"the rotation is known to {np.degrees(np.linalg.norm(alone[:3])):.2f} deg only (one sigma) "
+            f"about {_rotation_axis(rotation)}",
             advice.rotation,
         )
     return (
-        f"the translation is known to {100 * translation_m:.1f} cm only (one sigma), the LiDAR {words}",
+        f"the translation is known to {100 * np.linalg.norm(alone[3:6]):.1f} cm only (one sigma), "
+        f"the LiDAR {words}",
         advice.translation,
     )
 
@@ -264,7 +290,8 @@ def _rotation_axis(rotation: FloatArray) -> str:
     if abs(direction[axis]) > _ALONG_AXIS:
         return f"the LiDAR's {'xyz'[axis]} axis"
     x, y, z = np.round(direction * np.sign(direction[axis]), 2) + 0.0  # no -0.00
-    return f"the direction ({x:.2f}, {y:.2f}, {z:.2f}) of the LiDAR's axes"
+    # In brackets: a short reason leaves out what stands in parentheses.
+    return f"the axis [{x:.2f}, {y:.2f}, {z:.2f}] of the LiDAR's frame"
 
 
 def _axis_words(c_translation: FloatArray) -> str:

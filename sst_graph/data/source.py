@@ -245,13 +245,16 @@ def open_source(
         raise DataError(path, f"no path ({error.strerror})", "a drive") from None
     if not present:
         raise DataError(path, "no file or folder", "a drive")
-    layouts = []
-    for name in loader_names():
-        candidate = find_loader(name)
-        if candidate.recognizes(path):
-            return candidate.opened(path, chosen)
-        layouts.append(candidate.layout)
-    raise DataError(path, "no layout that is known", "; or ".join(layouts))
+    found = recognized(path)
+    if found is None:
+        layouts = [find_loader(name).layout for name in loader_names()]
+        raise DataError(path, "no layout that is known", "; or ".join(layouts))
+    return find_loader(found).opened(path, chosen)
+
+
+def recognized(path: Path) -> str | None:
+    """Name of the first format that a path looks like, or None."""
+    return next((name for name in loader_names() if find_loader(name).recognizes(path)), None)
 
 
 def source_options(

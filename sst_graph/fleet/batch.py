@@ -12,9 +12,11 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from hashlib import sha256
 from pathlib import Path
 
 from sst_graph.config import Settings, setting
+from sst_graph.covariance.observability import ObservabilityConfig
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.files.json_table import json_table
 from sst_graph.files.reading import FileKind, digest_of_file
@@ -33,6 +35,7 @@ from sst_graph.fleet.summary.tables import Row, csv_bytes, drive_rows, parquet_b
 from sst_graph.fleet.vehicles.fused import Vehicle, vehicle_json, vehicles_of
 from sst_graph.fleet.vehicles.walk import WalkConfig
 from sst_graph.result import result_file
+from sst_graph.segmentation.model_files import model_files
 
 BATCH = "batch.json"
 FORMAT = "sst-graph/batch"
@@ -40,7 +43,7 @@ VERSION = 1
 LOCK = ".sst-graph-batch.lock"
 VEHICLES = "vehicles"
 
-_NAME_FILES = ("--config", "--init", "--image-model", "--lidar-model")
+_NAME_FILES, _NAME_NETWORKS = ("--config", "--init"), ("--image-model", "--lidar-model")
 _OPTION_FILE = FileKind("a file that an option names", 2**36)
 
 
@@ -55,6 +58,7 @@ class BatchConfig(Settings):
         limits: of one attempt at a drive.
         retries: further attempts at a drive after a crash, or where its data could not be copied.
         walk: how calibrations of vehicles may drift, and the false-alarm rate.
+        observability: limits of the standard deviations of a vehicle's calibration that is ok.
     """
 
     options: tuple[str, ...] = ()
@@ -63,6 +67,7 @@ class BatchConfig(Settings):
     limits: Limits = field(default_factory=Limits)
     retries: int = setting(2, at_least=0, at_most=1000)
     walk: WalkConfig = field(default_factory=WalkConfig)
+    observability: ObservabilityConfig = field(default_factory=ObservabilityConfig)
 
 
 @dataclass(frozen=True)
@@ -103,15 +108,17 @@ class Outcome:
         rows: of the drives, what needs attention first.
         vehicles: of those that are known.
         names: of the summary's files.
+        others: how many drives of earlier runs, which were not given this time, have results there.
     """
 
     rows: list[Row]
     vehicles: list[Vehicle]
     names: list[str]
+    others: int = 0
 
     @property
     def all_fine(self) -> bool:
-        """Whether every drive is ok, and no vehicle changed or is contradicted."""
+        """Whether every drive and every vehicle is ok, and no drive is contradicted."""
         drives = all(row["status"] == "ok" and not row["contradicts"] for row in self.rows)
         return drives and all(one.status == "ok" for one in self.vehicles)
 
@@ -155,13 +162,18 @@ def open_batch(out: Place, options: Sequence[str]) -> Iterator[None]:
 
 
 def _digests(options: Sequence[str]) -> dict[str, str]:
-    """SHA-256 of the files that options name, by option."""
+    """SHA-256 of the files that options name, by option; of a network also of its own files."""
     found = {}
     for option in options:
         name, _, value = option.partition("=")
-        path = result_file(Path(value))
-        if name in _NAME_FILES and path.is_file():
-            found[option] = digest_of_file(path, _OPTION_FILE).hex()
+        if name in _NAME_NETWORKS:
+            files: Sequence[Path] = model_files(value)
+        else:
+            path = result_file(Path(value))
+            files = [path] if name in _NAME_FILES and path.is_file() else []
+        if files:
+            digests = [digest_of_file(path, _OPTION_FILE) for path in files]
+            found[option] = (digests[0] if len(files) == 1 else sha256(b"".join(digests)).digest()).hex()
     return found
 
 
@@ -219,7 +231,8 @@ def write_summary(
     Raises:
         OSError, DataError: it cannot be written.
     """
-    vehicles = vehicles_of(drives, records, config.walk)
+    vehicles = vehicles_of(drives, records, config.walk, config.observability)
+    others = _others(drives, out)
     report = "report.md" if "--no-report" in config.options else "report.html"
     rows, of_vehicles = drive_rows(drives, records, vehicles, report), vehicle_rows(vehicles)
     contents: dict[str, bytes | None] = {
@@ -227,7 +240,7 @@ def write_summary(
         "summary.parquet": parquet_bytes(rows),
         "vehicles.csv": csv_bytes(of_vehicles) or None,
         "vehicles.parquet": parquet_bytes(of_vehicles),
-        "summary.html": summary_html(rows, of_vehicles, vehicles).encode("utf-8"),
+        "summary.html": summary_html(rows, of_vehicles, vehicles, others).encode("utf-8"),
     }
     written = [name for name, data in contents.items() if data is not None]
     for name, data in contents.items():
@@ -241,7 +254,14 @@ def write_summary(
     for earlier in folder.below() if folder.is_folder() else []:
         if earlier.name.endswith(".json") and earlier.name not in names.values():
             earlier.remove()
-    return Outcome(rows, vehicles, written)
+    return Outcome(rows, vehicles, written, others)
+
+
+def _others(drives: Sequence[Drive], out: Place) -> int:
+    """How many results of drives that are not given stand in the folder."""
+    folder, given = out / DRIVES, {drive.name for drive in drives}
+    there = folder.below() if folder.is_folder() else []
+    return sum(place.name not in given for place in there)
 
 
 def _finished(jobs: Sequence[Job], out: Place) -> dict[str, Record]:

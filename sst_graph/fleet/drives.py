@@ -141,7 +141,8 @@ def _by_table(given: str) -> Callable[[Drive], Mapping[str, str | None]]:
     known: dict[str, dict[str, str]] = {}
     for row in _rows(Place.of(given), ("drive", "vehicle")):
         place = Place.of(row["drive"])
-        for key in {place.url, place.whole()}:
+        # A name without a folder may be that of the folder or that of its result.
+        for key in {place.url, place.whole()} | ({file_name(place.url)} if "/" not in place.url else set()):
             if known.setdefault(key, row) != row:
                 raise DataError(given, f"two rows of the drive {row['drive']}", "one vehicle and one date")
 

@@ -131,7 +131,8 @@ def _of_text(document: Document, start: str) -> set[str]:
             if value.get("format") == "sst-graph/rig":
                 expected = "the calibration.json of one (calibrate --init takes the folder of a rig)"
                 raise DataError(document.path, "a rig of several cameras", expected)
-            return {"gtsam"} if marginal else {"calibration"} if "T_camera_lidar" in value else set()
+            own = "T_camera_lidar" in value or value.get("format") == records.VEHICLE_FORMAT
+            return {"gtsam"} if marginal else {"calibration"} if own else set()
         return {"nuscenes"} if records.is_nuscenes(value) else set()
     if document.path.suffix == ".py" or _PYTHON_LINE.search(document.text):
         return {"ros2-launch"}

@@ -21,21 +21,29 @@ from sst_graph.marginal import CalibrationMarginal
 from sst_graph.result import UNNAMED_CAMERA
 
 Table = Mapping[str, Any]
+VEHICLE_FORMAT = "sst-graph/vehicle"
+"""Of the file that a batch writes of a vehicle."""
 _MOST_RADIANS = 100.0
 """Length of a rotation vector; what is longer is of another unit."""
 
 
 def read_own(document: Document, options: ImportOptions) -> Found:
-    """A JSON object with ``T_camera_lidar``, and where it is known ``time_offset_s`` and ``camera``.
+    """A JSON object with ``T_camera_lidar``, and where it is known ``time_offset_s`` and ``camera``; or a
+    vehicle's, which has these at its last drive.
 
     Raises:
         DataError: another camera than the one asked for, no pose, no time offset.
     """
-    table = JsonTable(document.json, str(document.path))
+    table, taken = JsonTable(document.json, str(document.path)), "as it is"
     _check_camera(table.data.get("camera"), options.camera, document.path)
+    if table.data.get("format") == VEHICLE_FORMAT:
+        if table.data.get("calibration") is None:
+            raise DataError(document.path, "a vehicle without a calibration", "one with a drive that counts")
+        table = table.table("calibration")
+        taken = f"the vehicle's, at its drive {table.text('drive')}"
     known = table.data.get("time_offset_s") is not None
     time_offset_s = table.time_offset_s("time_offset_s") if known else None
-    return Found(table.pose("T_camera_lidar"), time_offset_s, "as it is")
+    return Found(table.pose("T_camera_lidar"), time_offset_s, taken)
 
 
 def _check_camera(found: object, camera: str | None, path: Path) -> None:

@@ -30,11 +30,11 @@ def short_reason(reason: str) -> str:
     what, *rest = clauses
     what = what.split(";")[0].strip()
     if not rest:
-        return _cut(name + what, MOST_LETTERS)
+        return cut(name + what, MOST_LETTERS)
     remedy = rest[-1].split(";")[-1].strip()
     room = max(MOST_LETTERS - len(remedy) - 2, MOST_LETTERS // 2)
-    what = _cut(name + what, room)
-    return f"{what}: {_cut(remedy, MOST_LETTERS - len(what) - 2)}"
+    what = cut(name + what, room)
+    return f"{what}: {cut(remedy, MOST_LETTERS - len(what) - 2)}"
 
 
 def as_sentence(reason: str) -> str:
@@ -42,8 +42,14 @@ def as_sentence(reason: str) -> str:
     return reason if reason.endswith("…") else f"{reason}."
 
 
-def _cut(text: str, most: int) -> str:
-    """The text, ended at a word where it is longer."""
+def capitalized(text: str) -> str:
+    """With a capital at its beginning; a name that stands there before a colon stays as it is."""
+    first = text.split(" ", 1)[0]
+    return text if first.endswith(":") else text[:1].upper() + text[1:]
+
+
+def cut(text: str, most: int) -> str:
+    """A text of so many letters at most, ended at a word where it is longer."""
     if len(text) <= most:
         return text
     return text[: most - 1].rsplit(" ", 1)[0].rstrip(",;: ") + "…"

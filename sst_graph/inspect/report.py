@@ -10,7 +10,7 @@ import numpy as np
 
 from sst_graph.inspect.budget_text import budget_lines, estimated_lines
 from sst_graph.inspect.reasons import short_reasons
-from sst_graph.inspect.verdict import figure, fit_line, verdict
+from sst_graph.inspect.verdict import figure, fit_line, is_start, verdict
 from sst_graph.metrics import (
     CalibrationErrors,
     euler_angles_deg,
@@ -65,10 +65,12 @@ def summary(result: CalibrationResult, comparison: Comparison | None = None) -> 
     rows += [("estimated" if k == 0 else "", text) for k, text in enumerate(estimated_lines(result))]
     sweeps = _sweeps(result)
     rows += [("sweep" if k == 0 else "", text) for k, text in enumerate(sweeps)]
-    if result.initial is not None:
+    if is_start(result):
+        rows.append(("moved", "not: no estimate could be made, and this is the start"))
+    elif result.initial is not None:
         rows.append(("moved", _moved(result, result.initial)))
     if comparison is not None:
-        rows.append((f"against {comparison.name}", ""))
+        rows.append((f"{'start ' * is_start(result)}against {comparison.name}", ""))
         rows += [("", line) for line in error_lines(comparison.errors)]
     rows += [("fit", fit)] if (fit := fit_line(result)) else []
     rows += [("reason", reason) for reason in short_reasons(result)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -57,6 +58,12 @@ def largest_sigmas(result: CalibrationResult) -> tuple[float, float, float]:
     return float(np.degrees(np.sqrt(rotation))), 100.0 * np.sqrt(translation), 1e3 * covariance[6, 6] ** 0.5
 
 
+def is_start(result: CalibrationResult) -> bool:
+    """Whether no estimate could be made: what stands in the result is the start."""
+    start = gtsam.Pose3() if result.initial is None else result.initial
+    return not result.frames_used and bool(result.T_camera_lidar.equals(start, 1e-12))
+
+
 def verdict(result: CalibrationResult) -> str:
     """The result in one or two sentences, without terms of the trade.
 
@@ -65,6 +72,9 @@ def verdict(result: CalibrationResult) -> str:
     if result.status == "not_converged":
         first = next(iter(short_reasons(result)), "the estimate contradicts the data")
         return f"Do not use this calibration: {as_sentence(first)}"
+    if is_start(result):
+        first = next(iter(short_reasons(result)), "no frame could be used")
+        return f"No estimate: {as_sentence(first)} What stands in this result is the start."
     if result.status == "unobservable":
         first = next(iter(short_reasons(result)), "the data leave a direction open")
         return f"Not finished: {as_sentence(first)} As it is: {_known(result)}"

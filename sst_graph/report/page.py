@@ -15,9 +15,9 @@ from sst_graph.fit import CLOSE_PX, Fit, MatchedFrame
 from sst_graph.inspect.budget_text import budget_lines
 from sst_graph.inspect.inspection import Inspection, inspect_result, strong_correlations
 from sst_graph.inspect.inspection_text import MOST_SENTENCES, advice_sentences, correlation_sentence
-from sst_graph.inspect.reasons import as_sentence, short_reasons
+from sst_graph.inspect.reasons import as_sentence, capitalized, short_reasons
 from sst_graph.inspect.report import Comparison, error_lines, summary
-from sst_graph.inspect.verdict import DRIVING_MPS, figure, fit_line, misfits, verdict
+from sst_graph.inspect.verdict import DRIVING_MPS, figure, fit_line, is_start, misfits, verdict
 from sst_graph.report.close_ups import ZOOM, close_ups
 from sst_graph.report.drawn_frame import DrawnFrame, DriveReader
 from sst_graph.report.html import (
@@ -129,7 +129,7 @@ def _file(name: str) -> str:
 
 
 def _verdict(inputs: ReportInputs) -> str:
-    result = inputs.result
+    result, of_start = inputs.result, is_start(inputs.result)
     fit = fit_line(result)
     rows = [
         (
@@ -154,11 +154,15 @@ def _verdict(inputs: ReportInputs) -> str:
             "All figures are one standard deviation, of the worst axis or direction and at the worst place "
             "in the picture. About 19 times in 20 the error is below twice as much.",
             "note",
-        ),
-        paragraph(fit[0].upper() + fit[1:] + ".") if fit else "",
+        )
+        if not of_start
+        else "",
+        paragraph(capitalized(fit) + ".") if fit else "",
         paragraph(_CHECK) if fit and result.fit_is_check else "",
-        table(head, rows, "numbers"),
-        paragraph(f"Errors against {inputs.comparison.name}:") if inputs.comparison else "",
+        "" if of_start else table(head, rows, "numbers"),
+        paragraph(f"Errors {'of the start ' * of_start}against {inputs.comparison.name}:")
+        if inputs.comparison
+        else "",
         bullets(error_lines(inputs.comparison.errors)) if inputs.comparison else "",
     )
 
@@ -171,7 +175,7 @@ def _next(inspection: Inspection) -> str:
         if not any(one.sentence in reason for reason in result.reasons)
     ]
     nothing = f"No direction is past its limit. The weakest: {inspection.weakest.sentence}."
-    short = [as_sentence(reason[0].upper() + reason[1:]) for reason in short_reasons(result)]
+    short = [as_sentence(capitalized(reason)) for reason in short_reasons(result)]
     advice = [] if inspection.plan is None else advice_sentences(inspection, inspection.plan)
     return section(
         "next",
@@ -184,7 +188,7 @@ def _next(inspection: Inspection) -> str:
         )
         if advice
         else "",
-        bullets(one[0].upper() + one[1:] + "." for one in advice),
+        bullets(capitalized(one) + "." for one in advice),
     )
 
 

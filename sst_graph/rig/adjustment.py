@@ -41,9 +41,9 @@ class ComparedPose:
         """The difference, in words."""
         known, named = self.known, name_step(self.difference, gtsam.Pose3())
         return (
-            f"the known pose of {known.camera} in {known.reference} contradicts the estimates, which differ "
+            f"the known pose of {known.camera} in {known.reference} contradicts the estimates: they differ "
             f"from it in {named.sentence} (chi-squared {self.difference.chi2:.0f} of 6): check which camera "
-            "moved, the names of the cameras, and the direction of the transform"
+            "moved, the cameras' names and the transform's direction"
         )
 
 
@@ -68,7 +68,7 @@ class ComparedTrigger:
         steps = zip(self.names[1:], self.difference.step, sigmas, strict=True)
         each = ", ".join(f"{name} {1e3 * step:+.1f} ± {1e3 * sigma:.1f} ms" for name, step, sigma in steps)
         return (
-            f"one trigger of all cameras contradicts their time offsets, which differ from that of "
+            f"one trigger of all cameras contradicts their time offsets: they differ from that of "
             f"{self.names[0]} by {each} (chi-squared {self.difference.chi2:.0f} of {len(sigmas)}): check "
             "whether the cameras are triggered together, and whether images were lost"
         )

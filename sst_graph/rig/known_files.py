@@ -31,7 +31,7 @@ def read_known_poses(
 
     A ``calib.txt`` of KITTI's (its P lines), or a camera chain in YAML as Kalibr writes it: a table for each
     camera with ``T_cn_cnm1``, the pose of the camera before it in this one. Its cameras are found by the name
-    of their table, or by their ``rostopic``.
+    of their table, or by their ``rostopic`` or its namespace (``cam0`` of ``/cam0/image_raw``).
 
     Args:
         cameras: names of the rig's cameras.
@@ -74,7 +74,7 @@ def _of_chain(
     for place, (key, entry) in enumerate(entries):
         if place:
             cT0 = _link(entry, f"{path}: {key}") * cT0
-        found += [(camera, place, cT0) for camera in cameras if camera in (str(key), names[str(key)])]
+        found += [(camera, place, cT0) for camera in cameras if _is(camera, str(key), names[str(key)])]
     missing = [camera for camera in cameras if camera not in [name for name, _, _ in found]]
     if missing or not entries:
         listed = ", ".join(f"{key} ({topic})" if topic else key for key, topic in names.items())
@@ -84,6 +84,12 @@ def _of_chain(
         twice = next(name for name, _, _ in found if sum(name == other for other, _, _ in found) > 1)
         raise DataError(path, f"{twice} twice", "each camera once")
     return found
+
+
+def _is(camera: str, key: str, topic: str) -> bool:
+    """Whether a camera is that of a table: by its name, its topic, or the topic's namespace."""
+    plain, whole = camera.strip("/"), topic.strip("/")
+    return camera == key or (bool(plain) and f"{whole}/".startswith(f"{plain}/"))
 
 
 def _link(entry: Mapping[str, Any], place: str) -> gtsam.Pose3:

@@ -79,6 +79,12 @@ class OnnxImageSegmenter:
             raise DataError(model.network, "its 3 channels elsewhere", layout)
         changes = {"width": size[1] or width, "height": size[0] or height}
         self._input = PictureInput(**{**vars(model.input), **changes})
+        if self._network.dtype == np.uint8 and not self._input.keeps_pixels:
+            raise DataError(
+                model.network,
+                "an input of uint8, which takes the pixels as they are",
+                f"range: 1, mean: [0, 0, 0] and std: [1, 1, 1] in {model.path.name}",
+            )
         self.model = model
 
     @property
@@ -122,11 +128,9 @@ class OnnxImageSegmenter:
     def _labels(self, array: NDArray[Any], place: Placement) -> NDArray[np.uint8]:
         """Classes (h', w') of a map of numbers."""
         found = array.shape
-        array = array.reshape(array.shape[-2:]) if array.ndim >= 2 and array[..., 0, 0].size == 1 else array
+        array = array.squeeze()  # of the batch and of a channel, first or last
         if array.ndim != 2 or not _fits(array.shape[1], array.shape[0], place):
-            raise DataError(
-                self.model.network, f"labels of shape {found}", f"1 x h x w of {_proportions(place)}"
-            )
+            raise self._unfit("labels", found, f"1 x h x w of {_proportions(place)}")
         if array.dtype.kind == "f" and (array != np.floor(array)).any():
             found_values = "labels that are no whole numbers (logits?)"
             raise DataError(self.model.network, found_values, "numbers of classes (output: labels)")
@@ -139,11 +143,17 @@ class OnnxImageSegmenter:
                 return np.asarray(array[0])
             if _fits(array.shape[2], array.shape[1], place) and array.shape[3] > 1:
                 return np.asarray(array[0].transpose(2, 0, 1))
-        raise DataError(
-            self.model.network,
-            f"logits of shape {array.shape}",
-            f"1 x classes x h x w or 1 x h x w x classes, h x w of {_proportions(place)}",
-        )
+        expected = f"1 x classes x h x w or 1 x h x w x classes, h x w of {_proportions(place)}"
+        raise self._unfit("logits", array.shape, expected)
+
+    def _unfit(self, kind: str, shape: tuple[int, ...], expected: str) -> DataError:
+        """An error about an output of another shape; it names the output where there are others."""
+        names = self._network.outputs
+        found, remedy = f"{kind} of shape {shape}", ""
+        if len(names) > 1:
+            found += f" in the output {self.model.outputs.get(kind, names[0])} of {', '.join(names)}"
+            remedy = f" (another one: outputs: {{{kind}: NAME}})"
+        return DataError(self.model.network, found, expected + remedy)
 
     def _detected(self, outputs: Mapping[str, NDArray[Any]], place: Placement) -> ImageLabels:
         """Mask and instances of detections: of two that overlap the better one has the pixel."""

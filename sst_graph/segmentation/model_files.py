@@ -13,6 +13,7 @@ from sst_graph.files.yaml_file import number, numbers, read_yaml
 from sst_graph.segmentation.hugging_face import HuggingFaceSegmenter
 from sst_graph.segmentation.image_network import MIN_SCORE, ImageModel, OnnxImageSegmenter
 from sst_graph.segmentation.label_numbers import LabelNumbers, label_numbers
+from sst_graph.segmentation.onnx_network import weights_beside
 from sst_graph.segmentation.picture_input import PictureInput
 from sst_graph.segmentation.range_view import CHANNELS, Neighbours, RangeView
 from sst_graph.segmentation.scan_network import OnnxScanSegmenter, ScanModel
@@ -74,6 +75,26 @@ def open_scan_segmenter(model: str | Path) -> ScanSegmenter:
         return OnnxScanSegmenter(bonnetal_model(path))
     path = _described(path, f"a YAML file, or a folder with {_ARCH}, {_DATA} and {_MODEL}")
     return OnnxScanSegmenter(scan_model(path, read_yaml(path)))
+
+
+def model_files(model: str | Path) -> tuple[Path, ...]:
+    """The files that a network for pictures or scans is made from; none of one on a hub.
+
+    Raises:
+        DataError: nothing there, or no description of a network.
+    """
+    if str(model).startswith(HUB):
+        return ()
+    path = Path(model)
+    if os.path.isdir(path):
+        return tuple(sorted(one for one in path.iterdir() if one.is_file()))
+    path = _described(path, "a YAML file, or a folder with a network")
+    table = read_yaml(path)
+    if "hugging_face" in table:
+        folder = path.parent / _text(table, "hugging_face", path)
+        return (path, *(model_files(folder) if os.path.isdir(folder) else ()))
+    network = path.parent / _text(table, "network", path)
+    return (path, network, *weights_beside(network))
 
 
 def image_model(path: Path, table: Mapping[str, Any]) -> ImageModel:

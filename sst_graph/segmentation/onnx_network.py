@@ -166,11 +166,15 @@ def _runtime(path: Path) -> Any:
     return onnxruntime
 
 
+def weights_beside(path: Path) -> list[Path]:
+    """Files of weights of a network: those beside it that begin with its name."""
+    return [one for one in sorted(path.parent.glob(f"{_escaped(path.name)}?*")) if one.is_file()]
+
+
 def _digest(path: Path) -> str:
     digest = hashlib.sha256(digest_of_file(path, NETWORK))
-    for beside in sorted(path.parent.glob(f"{_escaped(path.name)}?*")):
-        if beside.is_file():
-            digest.update(beside.name.encode() + digest_of_file(beside, _WEIGHTS))
+    for beside in weights_beside(path):
+        digest.update(beside.name.encode() + digest_of_file(beside, _WEIGHTS))
     return digest.hexdigest()
 
 

@@ -37,6 +37,13 @@ class PictureInput:
     std: tuple[float, float, float] = (0.229, 0.224, 0.225)
     layout: Layout = "nchw"
 
+    @property
+    def keeps_pixels(self) -> bool:
+        """Whether the values are the pixels themselves, 0 to 255."""
+        black_and_white = np.array([[0.0], [255.0]])
+        values = (black_and_white / self.range - np.array(self.mean)) / np.array(self.std)
+        return bool((np.rint(values) == black_and_white).all())
+
     def place(self, width: int, height: int) -> Placement:
         """Where a picture of a size [px] lies in the input."""
         w, h = self.width or width, self.height or height

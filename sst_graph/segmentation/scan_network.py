@@ -57,6 +57,8 @@ class OnnxScanSegmenter:
         self._network = OnnxNetwork(model.network)
         expected = (1, CHANNELS, model.view.height, model.view.width)
         self._network.check_input(expected, "1 x 5 channels (range, x, y, z, remission) x height x width")
+        if self._network.dtype == np.uint8:
+            raise DataError(model.network, "an input of uint8", "one of floating-point numbers")
 
     @property
     def name(self) -> str:

@@ -192,15 +192,17 @@ def test_no_check_no_contradiction() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("own_offsets", ["false", "true"])
-def test_drives_of_two_rigs(own_offsets: str) -> None:
+@pytest.mark.parametrize(("own_offsets", "degrees"), [("false", 1.1), ("true", 1.1), ("false", 4.0)])
+def test_drives_of_two_rigs(own_offsets: str, degrees: float) -> None:
+    """One estimate for two mounts may say what it wants of lens and ranges: that they are two comes first."""
     config = with_overrides(CONFIG, [f"time_offset_per_drive={own_offsets}"])
     frames = frames_of()
-    two = [edited(street(), frames[:12], "a"), edited(street(), knocked(frames[12:], 0, 1.1), "b")]
+    two = [edited(street(), frames[:12], "a"), edited(street(), knocked(frames[12:], 0, degrees), "b")]
     result = calibrated(two, config)
     assert result.status == "not_converged"
     (reason,) = [reason for reason in result.reasons if "contradicts" in reason]
-    assert reason.startswith("drive 'b' contradicts drive 'a': it differs in rotation by 1.")
+    assert reason.startswith(f"drive 'b' contradicts drive 'a': it differs in rotation by {degrees:.0f}.")
+    assert reason == result.reasons[0]
     assert "(pitch)" in reason
 
 

@@ -31,6 +31,34 @@ def drives(kitti_drive: Path, tmp_path: Path) -> Path:
     return folder
 
 
+def test_a_drive_in_the_place_of_a_folder_of_drives_is_told(
+    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What stands in it is no drive; without the note its errors name folders that were never given."""
+    drive = drives / "v1_2026-03-01"
+    command = ["batch", str(drive), "--out", str(tmp_path / "out"), "--workers", "1"]
+    assert main(command) == 3
+    told = capsys.readouterr().err
+    assert f"note: {drive} looks like one drive (kitti); what stands in it (sequences) is taken for" in told
+    assert main(["batch", str(drives), "--out", str(tmp_path / "other"), "--vehicle-from", "x(y)"]) == 2
+    assert "looks like one drive" not in capsys.readouterr().err
+
+
+def test_a_batch_in_the_folder_of_its_drives_goes_on(
+    drives: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its own folder is no drive, when the same command is given again."""
+    for name in ("v1_2026-03-01", "v1_2026-03-08", "v2_2026-03-01"):
+        shutil.rmtree(drives / name)
+    command = ["batch", str(drives), "--out", str(drives / "out"), "--workers", "1"]
+    for _ in range(2):
+        assert main(command) == 3
+        assert "1: 1 bad_input" in capsys.readouterr().out
+    shutil.rmtree(drives / "v2_2026-03-08")
+    assert main(command) == 2
+    assert "found no drive beside this folder of the batch" in capsys.readouterr().err
+
+
 def rows_of(out: Path) -> dict[str, dict[str, str]]:
     with (out / "summary.csv").open(newline="") as stream:
         return {row["drive"]: row for row in csv.DictReader(stream)}
@@ -270,6 +298,32 @@ def test_a_file_of_the_options_is_the_same_to_the_end(
     assert main(command) == 2
     said = capfd.readouterr().err
     assert f"was begun with other contents of --config={tmp_path}/settings.json" in said
+
+
+@pytest.mark.parametrize(
+    ("option", "named", "changed"),
+    [
+        ("--image-model", "net.yaml", "net.onnx"),
+        ("--image-model", "net.onnx", "net.onnx.data"),
+        ("--lidar-model", ".", "data_cfg.yaml"),
+    ],
+)
+def test_a_network_of_the_options_is_the_same_to_the_end(
+    drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], option: str, named: str, changed: str
+) -> None:
+    """Its weights, beside what describes it, or a file of its folder: labels would be of two networks."""
+    nets = tmp_path / "nets"
+    nets.mkdir()
+    (nets / "net.yaml").write_text("network: net.onnx\nclasses: coco\n")
+    for name in ("net.onnx", "net.onnx.data", "data_cfg.yaml"):
+        (nets / name).write_text("1")
+    command = ["batch", str(drives / "v2_*-08"), "--out", str(tmp_path / "out"), "--retries", "0"]
+    command += [option, str(nets / named)]
+    assert main(command) == 3 == main(command)
+    (nets / changed).write_text("2")
+    capfd.readouterr()
+    assert main(command) == 2
+    assert f"was begun with other contents of {option}={nets / named}" in capfd.readouterr().err
 
 
 def test_two_batches_do_not_meet(drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

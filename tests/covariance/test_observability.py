@@ -112,7 +112,7 @@ def test_the_other_sign_of_the_time_offset() -> None:
         ),
         (
             [0.03, 0, -0.04, 0, 0, 0, 0],
-            "about the direction (-0.60, 0.00, 0.80) of the LiDAR's axes",
+            "about the axis [-0.60, 0.00, 0.80] of the LiDAR's frame",
             "all sides",
         ),
         ([0, 0, 0, 0, 0.3, 0, 0], "known to 30.0 cm only (one sigma), the LiDAR shifted", "nearer"),
@@ -144,6 +144,31 @@ def test_a_rotation_that_goes_with_the_time_offset() -> None:
     assert "taken earlier" in other.sentence
     (alone,) = weak_directions(with_direction(np.array([0.003, 0, 0, 0, 0, 0, 0.2])), CTL, CONFIG)
     assert alone.sentence == "the time offset is known to 200.0 ms only (one sigma)"
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "words"),
+    [
+        (6, 4, "the time offset is known to 24.0 ms only (one sigma)"),
+        (3, 2, "the translation is known to 24.0 cm only (one sigma), the LiDAR shifted forward"),
+        (2, 3, "the rotation is known to 13.75 deg only (one sigma) about the LiDAR's z axis"),
+    ],
+)
+def test_what_is_named_alone_has_its_own_sigma(one: int, other: int, words: str) -> None:
+    """That of the covariance's diagonal, as in the tables beside it, not the part of it on the weak axis."""
+    sigmas = np.array([1e-3] * 3 + [1e-2] * 3 + [1e-3])
+    sigmas[one] = 0.24 * (0.1 if one == 6 else 1.0)
+    sigmas[other] = 0.02 if other == 2 else 0.1
+    correlation = np.eye(7)
+    correlation[one, other] = correlation[other, one] = 0.5
+    weak, *_ = weak_directions(correlation * np.outer(sigmas, sigmas), CTL, CONFIG)
+    assert words in weak.sentence
+
+
+def test_the_axis_of_a_rotation_stays_in_a_short_reason() -> None:
+    (weak,) = weak_directions(with_direction(np.array([0.03, 0, -0.04, 0, 0, 0, 0])), CTL, CONFIG)
+    short = short_reason(f"{weak.sentence}: {weak.advice}")
+    assert "known to 2.87 deg only about the axis [-0.60, 0.00, 0.80] of the LiDAR" in short
 
 
 def test_a_translation_that_hardly_depends_on_the_time_offset_names_no_rate() -> None:

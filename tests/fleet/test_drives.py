@@ -60,6 +60,15 @@ def test_vehicle_and_date_by_a_table(tree: Path, tmp_path: Path) -> None:
     assert (second.vehicle, second.date, second.day) == ("car 7", "", None)
 
 
+def test_a_table_names_a_drive_by_its_folder(tmp_path: Path) -> None:
+    """Also where the folder's name is no name of a result: with blanks and signs."""
+    (tmp_path / "data" / "run 1 – rain").mkdir(parents=True)
+    table = tmp_path / "vehicles.csv"
+    table.write_text("drive,vehicle\nrun 1 – rain,car 7\n")
+    (found,) = with_vehicles(find_drives(str(tmp_path / "data")), str(table))
+    assert (found.name, found.vehicle) == ("run_1_rain", "car 7")
+
+
 def test_a_table_is_of_one_vehicle_a_drive(
     tree: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

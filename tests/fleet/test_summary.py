@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from fleet.vehicle_drives import RIG, SIGMAS
 
+from sst_graph import report
 from sst_graph.errors import DataError
 from sst_graph.export import fuse_marginals, marginal_of_result
 from sst_graph.factors import PinholeCamera
@@ -23,6 +24,7 @@ from sst_graph.fleet.record import Cost, Numbers, Status
 from sst_graph.fleet.summary import page as summary_page
 from sst_graph.fleet.vehicles.fused import vehicle_of
 from sst_graph.fleet.vehicles.walk import WalkConfig
+from sst_graph.reference import read_reference
 from sst_graph.result import CalibrationResult
 
 
@@ -32,6 +34,27 @@ def test_every_status_has_a_colour_and_a_rank() -> None:
     assert sorted(ranks) == list(range(len(ranks)))
     for status in get_args(Status):
         assert re.search(rf"\.s-{status}\b", style), status
+
+
+def _luminance(colour: str) -> float:
+    """Of #rrggbb, as WCAG 2 has it."""
+    values = np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) / 255.0
+    linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+    return float(linear @ (0.2126, 0.7152, 0.0722))
+
+
+def test_a_status_can_be_read_on_its_colour_in_light_and_dark() -> None:
+    own = (Path(summary_page.__file__).parent / "page.css").read_text()
+    shared = (Path(report.__file__).parent / "page.css").read_text()
+    (text,) = re.findall(r"\.tag \{[^}]*[ ;]color: var\(--(\w+)\)", own)
+    grounds = set(re.findall(r"background: var\(--(\w+)\); \}", own)) - {"panel"}
+    light = dict(re.findall(r"--(\w+): (#\w{6})", shared.split("@media")[0]))
+    dark = light | dict(re.findall(r"--(\w+): (#\w{6})", shared.split("@media")[1]))
+    assert len(grounds) == 4 and light["back"] != dark["back"]
+    for colours in (light, dark):
+        for ground in grounds:
+            high, low = sorted((_luminance(colours[text]), _luminance(colours[ground])), reverse=True)
+            assert (high + 0.05) / (low + 0.05) > 4.3, ground
 
 
 CAMERA = PinholeCamera(700.0, 700.0, 600.0, 180.0, 1242, 375)
@@ -142,6 +165,67 @@ def test_reasons_that_drives_share_are_counted_together(tmp_path: Path) -> None:
     assert "0 of 4 drives are ok; 0 have no result" in page
 
 
+def test_a_contradiction_is_no_other_reason(tmp_path: Path) -> None:
+    """What a drive says of itself is counted with others that say the same; that it contradicts, apart."""
+    drives = [drive(f"x{k}", "v") for k in range(6)]
+    records = {
+        one.name: done(one.name, result(k, "unobservable", 0.03 * (k == 2))) for k, one in enumerate(drives)
+    }
+    long = (
+        "the time offset is known to 340.2 ms only: record motion, several frames at some speed, with a " * 2
+    )
+    records |= {name: replace(record, reason=long + "turn") for name, record in records.items()}
+    write_summary(drives, records, Place.of(tmp_path), BatchConfig())
+    page = (tmp_path / "summary.html").read_text()
+    assert "<li>1 × contradicts the other drives of its vehicle</li>" in page
+    (kind,) = re.findall(r"<li>6 × unobservable: ([^<]*)</li>", page)
+    assert kind.endswith(" motion…") and long.replace("340.2", "…").startswith(kind[:-1])
+    # The drives that count and those that do not are all there are.
+    assert re.search(r'<td class="num">5</td><td class="num">1</td>', page)
+
+
+def test_a_vehicle_whose_drives_all_leave_a_direction_open_is_unobservable(tmp_path: Path) -> None:
+    """Each drive is, too; where they see different directions, the vehicle is ok."""
+    drives = [drive("x", "v"), drive("y", "v")]
+
+    def outcome(*wide: int) -> tuple[str, str]:
+        records = {}
+        for one, axis in zip(drives, wide, strict=True):
+            found = result(1, "unobservable")
+            covariance = np.array(found.covariance)
+            covariance[axis, axis] = 0.3**2
+            records[one.name] = done(one.name, replace(found, covariance=covariance))
+        (vehicle,) = write_summary(drives, records, Place.of(tmp_path), BatchConfig()).vehicles
+        return vehicle.status, vehicle.reason
+
+    status, reason = outcome(6, 6)
+    assert status == "unobservable" and reason.startswith("by all drives, the time offset is known to 2")
+    assert "1 of 1 vehicle needs attention" in (tmp_path / "summary.html").read_text()
+    assert outcome(6, 3) == ("ok", "")
+
+
+def test_drives_of_earlier_runs_that_are_not_given_are_told(tmp_path: Path) -> None:
+    for name in ("x", "y", "z"):
+        (tmp_path / "drives" / name).mkdir(parents=True)
+    records = {"x": done("x", result(0))}
+    outcome = write_summary([drive("x")], records, Place.of(tmp_path), BatchConfig())
+    assert outcome.others == 2
+    page = (tmp_path / "summary.html").read_text()
+    assert "2 drives of earlier runs were not given this time: they are in no table and in no vehicle" in page
+
+
+def test_a_drift_is_not_drawn_across_a_change(
+    batch: tuple[list[Drive], dict[str, Record]], tmp_path: Path
+) -> None:
+    drives, records = batch
+    write_summary(drives, records, Place.of(tmp_path), BatchConfig())
+    page = (tmp_path / "summary.html").read_text()
+    rotation = page[page.index("Rotation") :].split("</svg></figure>")[0].split("Translation")[0]
+    # Three axes, each drawn before the change and after it.
+    assert len(re.findall('class="line [abc]"', rotation)) == 6
+    assert len(re.findall('class="band [abc]"', rotation)) == 6
+
+
 def test_all_fine(tmp_path: Path) -> None:
     drives = [drive("x", "v"), drive("y", "v")]
     records = {name: done(name, result(k)) for k, name in enumerate("xy")}
@@ -163,6 +247,21 @@ def test_a_contradicting_drive_stands_before_those_that_are_ok(tmp_path: Path) -
     outcome = write_summary(drives, records, Place.of(tmp_path), BatchConfig())
     assert outcome.rows[0]["drive"] == "x2" and outcome.rows[0]["contradicts"] is True
     assert "contradicts the other drives of v" in str(outcome.rows[0]["reason"]) and not outcome.all_fine
+
+
+def test_a_vehicle_is_a_start_and_a_truth(tmp_path: Path) -> None:
+    """``--init`` and ``--truth`` read the calibration of its file."""
+    drives = [drive("x", "v"), drive("y", "v"), drive("z", "w")]
+    named = [replace(result(k), camera_name="image_2") for k in range(2)]
+    records = {name: done(name, found) for name, found in zip("xy", named, strict=True)}
+    (known, _) = write_summary(drives, records, Place.of(tmp_path), BatchConfig()).vehicles
+    found = read_reference(tmp_path / "vehicles/v.json", "image_2")
+    assert known.calibration is not None and found.cTl.equals(known.calibration.cTl, 1e-12)
+    assert found.time_offset_s == pytest.approx(known.calibration.time_offset_s)
+    with pytest.raises(DataError, match=r"a calibration of camera image_2, expected one of image_3"):
+        read_reference(tmp_path / "vehicles/v.json", "image_3")
+    with pytest.raises(DataError, match="a vehicle without a calibration"):
+        read_reference(tmp_path / "vehicles/w.json")
 
 
 def test_what_drives_have_in_common_does_not_average_out() -> None:

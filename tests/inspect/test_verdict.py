@@ -10,10 +10,13 @@ import pytest
 
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.fit import FitQuality
-from sst_graph.inspect.reasons import MOST_LETTERS, as_sentence, short_reason, short_reasons
-from sst_graph.inspect.verdict import fit_line, largest_sigmas, misfits, quality_line, verdict
+from sst_graph.inspect.reasons import MOST_LETTERS, as_sentence, capitalized, short_reason, short_reasons
+from sst_graph.inspect.report import Comparison, summary
+from sst_graph.inspect.verdict import fit_line, is_start, largest_sigmas, misfits, quality_line, verdict
+from sst_graph.metrics import CalibrationErrors
 from sst_graph.odometry.sweep import REMEDY
-from sst_graph.result import CalibrationResult
+from sst_graph.report import ReportInputs, report_html
+from sst_graph.result import CalibrationResult, FrameId
 
 CAMERA = PinholeCamera(700.0, 700.0, 620.0, 187.0, 1241, 375)
 OPTICAL = gtsam.Pose3(gtsam.Rot3(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])), np.zeros(3))
@@ -78,6 +81,29 @@ def test_verdicts_of_the_three_statuses() -> None:
     assert open_.startswith("Not finished: the shift is open: record a stop. As it is: 0.050°")
     bad = verdict(_result(sigmas, status="not_converged", reasons=("stamps are late: check the clock",)))
     assert bad == "Do not use this calibration: stamps are late: check the clock."
+
+
+def test_a_start_that_stands_for_an_estimate_is_none() -> None:
+    """Its errors against a published calibration, which is the start, would be 0."""
+    reasons = ("no frame shows the classes: label some",)
+    start = _result([1.0] * 3 + [2.0] * 3 + [1.0], status="unobservable", initial=OPTICAL, reasons=reasons)
+    assert is_start(start)
+    said = "No estimate: no frame shows the classes: label some. What stands in this result is the start."
+    assert verdict(start) == said
+    comparison = Comparison(CalibrationErrors(0.0, 0.0, 0.0, 0.0, None), "the truth")
+    lines = summary(start, comparison).splitlines()
+    assert "moved           not: no estimate could be made, and this is the start" in lines
+    assert "start against the truth" in lines
+    page = report_html(ReportInputs(start, [], comparison))
+    assert "Errors of the start against the truth:" in page and "driving at" not in page
+    moved = replace(start, T_camera_lidar=OPTICAL * gtsam.Pose3(gtsam.Rot3(), np.array([0.1, 0.0, 0.0])))
+    assert not is_start(moved) and not is_start(replace(start, frames_used=(FrameId("a", 0),)))
+    assert verdict(moved).startswith("Not finished: ")
+
+
+def test_names_keep_their_letters() -> None:
+    assert capitalized("rig2/00: the scans show nothing") == "rig2/00: the scans show nothing"
+    assert capitalized("the time offset: x") == "The time offset: x"
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from rigs import marginal_of
 
 from sst_graph.errors import ConfigError
 from sst_graph.factors.camera_pose import camera_pose_error
+from sst_graph.inspect.reasons import short_reason
 from sst_graph.rig import KnownPose, KnownRig, RigMarginal
 from sst_graph.rig.adjustment import adjusted, compare_poses, compare_trigger
 from sst_graph.rig.known import TRIGGER_SIGMA_S, poses_by_nominal
@@ -74,6 +75,10 @@ def test_a_pose_that_contradicts_the_estimates(turn_deg: float, contradicted: bo
     if contradicted:
         assert "known pose of cam1 in cam0 contradicts" in compared.sentence
         assert "rotation by 3.0" in compared.sentence and "chi-squared" in compared.sentence
+        assert short_reason(compared.sentence) == (
+            "the known pose of cam1 in cam0 contradicts the estimates: check which camera moved, "
+            "the cameras' names and the transform's direction"
+        )
 
 
 def test_false_alarms_are_as_rare_as_they_should_be() -> None:
@@ -116,6 +121,10 @@ def test_one_trigger() -> None:
     compared = compare_trigger(apart, KnownRig(one_trigger=True), [50.0] * 3)
     assert compared is not None and compared.contradicted
     assert "cam2 +100.0" in compared.sentence
+    assert short_reason(compared.sentence) == (
+        "one trigger of all cameras contradicts their time offsets: check whether the cameras are "
+        "triggered together, and whether images were lost"
+    )
     assert compare_trigger(marginal, KnownRig(), [50.0] * 3) is None
 
 

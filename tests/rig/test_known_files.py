@@ -48,6 +48,33 @@ def test_links_add_up_and_topics_name_cameras(chain: Path) -> None:
     assert pose.rotation_sigma_deg == pytest.approx(0.02 * np.sqrt(2))
 
 
+@pytest.mark.parametrize(
+    ("cameras", "topics"),
+    [
+        (("left", "right"), ("/left/image_raw", "/right/image_raw")),
+        (("left/image_raw", "right/image_raw"), ("/left/image_raw", "/right/image_raw")),
+        (("image_2", "image_3"), ("/image_2", "/image_3")),  # so export writes the cameras of folders
+    ],
+)
+def test_a_topic_names_a_camera_without_its_slash_and_by_its_namespace(
+    tmp_path: Path, cameras: tuple[str, str], topics: tuple[str, str]
+) -> None:
+    path = tmp_path / "camchain.yaml"
+    link = f"T_cn_cnm1:\n{_rows(LINK_1)}"
+    path.write_text(f"cam0:\n  rostopic: {topics[0]}\ncam1:\n  rostopic: {topics[1]}\n  {link}")
+    (pose,) = read_known_poses(path, cameras)
+    assert (pose.camera, pose.reference) == (cameras[1], cameras[0])
+    assert pose.T_camera_reference.equals(LINK_1, 1e-9)
+
+
+def test_a_name_of_a_table_that_is_another_one_s_topic_is_ambiguous(tmp_path: Path) -> None:
+    path = tmp_path / "camchain.yaml"
+    swapped = "rostopic: /cam1/image\ncam1:\n  rostopic: /cam0/image"
+    path.write_text(f"cam0:\n  {swapped}\n  T_cn_cnm1:\n{_rows(LINK_1)}")
+    with pytest.raises(DataError, match="cam0 twice"):
+        read_known_poses(path, ["cam0", "cam1"])
+
+
 def test_names_of_the_data_set(tmp_path: Path) -> None:
     path = tmp_path / "rig.yaml"
     path.write_text(f"image_2: {{}}\nimage_3:\n  T_cn_cnm1:\n{_rows(LINK_1)}")

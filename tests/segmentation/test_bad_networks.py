@@ -96,6 +96,30 @@ def of_fixed_size(folder: Path) -> Path:
     return colour_yaml(folder / "n.onnx", "width: 96\nheight: 64\n")
 
 
+def of_bytes_in(more: str) -> Made:
+    """A network that takes pixels as they are, and a file that says otherwise."""
+
+    def make(folder: Path) -> Path:
+        cast = ("Cast", ["input"], ["logits"], {"to": TensorProto.FLOAT})
+        shape, outputs = [1, 3, "h", "w"], [("logits", TensorProto.FLOAT)]
+        write_network(folder / "n.onnx", [cast], shape, outputs, kind=TensorProto.UINT8)
+        (folder / "n.yaml").write_text(f"network: n.onnx\nclasses: {{0: sky, others: vehicle}}\n{more}")
+        return folder / "n.yaml"
+
+    return make
+
+
+def auxiliary_first(folder: Path) -> Path:
+    """Of two outputs the first is another one, of one channel."""
+    nodes = [
+        ("ReduceMean", ["input"], ["aux"], {"axes": [1]}),
+        ("Relu", ["input"], ["main"], {}),
+    ]
+    outputs = [("aux", TensorProto.FLOAT), ("main", TensorProto.FLOAT)]
+    write_network(folder / "n.onnx", nodes, [1, 3, "h", "w"], outputs)
+    return colour_yaml(folder / "n.onnx")
+
+
 BAD_IMAGE_MODELS: dict[str, tuple[Made, str]] = {
     "no file": (lambda folder: folder / "n.yaml", "n.yaml: found no file or folder, expected a YAML file, "),
     "a folder": (lambda folder: folder, "found a folder, expected a YAML file, a folder with config.json"),
@@ -162,6 +186,16 @@ BAD_IMAGE_MODELS: dict[str, tuple[Made, str]] = {
         colour("outputs: {logits: seg}\n"),
         "n.onnx: found outputs scores, expected one called seg",
     ),
+    "the first of two outputs": (
+        auxiliary_first,
+        "found logits of shape (1, 1, 32, 64) in the output aux of aux, main, expected 1 x classes x h x w "
+        "or 1 x h x w x classes, h x w of 32 x 64, or less by a stride up to 32 (another one: outputs: {",
+    ),
+    "pixels scaled for an input of uint8": (
+        of_bytes_in(""),
+        "n.onnx: found an input of uint8, which takes the pixels as they are, expected range: 1, mean: [0, 0",
+    ),
+    "0 to 1 for an input of uint8": (of_bytes_in(PLAIN), "n.onnx: found an input of uint8, which takes"),
     "no instances": (
         colour("output: instances\n"),
         "n.onnx: found outputs scores, expected one called labels",
@@ -183,6 +217,13 @@ def ranged(more: str = "", size: tuple[int, int] = (16, 64), **options: Any) -> 
     return lambda folder: range_yaml(write_range_network(folder / "n.onnx", **options), more, size)
 
 
+def of_bytes_of_a_range_image(folder: Path) -> Path:
+    cast = ("Cast", ["input"], ["logits"], {"to": TensorProto.FLOAT})
+    outputs = [("logits", TensorProto.FLOAT)]
+    write_network(folder / "n.onnx", [cast], [1, 5, 16, 64], outputs, kind=TensorProto.UINT8)
+    return range_yaml(folder / "n.onnx")
+
+
 BAD_SCAN_MODELS: dict[str, tuple[Made, str]] = {
     "no file": (lambda folder: folder / "n.yaml", "n.yaml: found no file or folder, expected a YAML file, "),
     "no arch_cfg": (lambda folder: folder, "arch_cfg.yaml: found no such file"),
@@ -193,6 +234,10 @@ BAD_SCAN_MODELS: dict[str, tuple[Made, str]] = {
     "a network for pictures": (
         lambda folder: range_yaml(write_colour_network(folder / "n.onnx")),
         "n.onnx: found an input of 1x3xanyxany, expected 1x5x16x64",
+    ),
+    "an input of uint8": (
+        of_bytes_of_a_range_image,
+        "found an input of uint8, expected one of float",
     ),
     "too many outputs": (ranged(classes=5), "n.onnx: found 5 outputs a pixel, and no class for output 3"),
     "an even window": (

@@ -43,6 +43,29 @@ def test_a_picture_comes_back_pixel_by_pixel(tmp_path: Path, nhwc: bool, labels:
     assert found.instances is None
 
 
+def test_a_network_that_takes_bytes_has_the_pixels_as_they_are(tmp_path: Path) -> None:
+    constants = {"W": np.array([[1, 0, 0], [0, 0, 0]], np.float32)[:, :, None, None]}
+    constants["b"] = np.array([-127.5, 0.0], np.float32)
+    nodes = [
+        ("Cast", ["input"], ["floats"], {"to": TensorProto.FLOAT}),
+        ("Conv", ["floats", "W", "b"], ["scores"], {"kernel_shape": [1, 1]}),
+    ]
+    shape, outputs = [1, 3, "h", "w"], [("scores", TensorProto.FLOAT)]
+    path = write_network(tmp_path / "n.onnx", nodes, shape, outputs, constants, kind=TensorProto.UINT8)
+    described = path.with_suffix(".yaml")
+    as_they_are = "range: 1\nmean: [0, 0, 0]\nstd: [1, 1, 1]\n"
+    described.write_text(f"network: n.onnx\nclasses: {{0: vehicle, 1: ground}}\n{as_they_are}")
+    assert (open_image_segmenter(described).segment(BOX).mask == expected(BOX)).all()
+
+
+def test_labels_may_keep_a_channel_last(tmp_path: Path) -> None:
+    """As an argmax over the last axis that keeps it."""
+    nodes = [("ArgMax", ["input"], ["numbers"], {"axis": 3, "keepdims": 1})]
+    path = write_network(tmp_path / "n.onnx", nodes, [1, "h", "w", 3], [("numbers", TensorProto.INT64)])
+    found = open_image_segmenter(colour_yaml(path, "layout: nhwc\noutput: labels\n")).segment(BOX)
+    assert found.mask.shape == BOX.mask.shape and (found.mask == VEHICLE)[8, 20]
+
+
 def test_channels_are_in_the_order_of_the_file(tmp_path: Path) -> None:
     path = write_colour_network(tmp_path / "n.onnx")
     blue_first = open_image_segmenter(colour_yaml(path, "channels: bgr\n"))

@@ -6,15 +6,17 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from importlib.resources import files
+from itertools import pairwise
 from urllib.parse import quote
 
 import numpy as np
 
 from sst_graph.errors import count_of
 from sst_graph.fleet.drives import file_name
-from sst_graph.fleet.summary.tables import Row
+from sst_graph.fleet.summary.tables import Row, own_reason
 from sst_graph.fleet.vehicles.fused import Vehicle
 from sst_graph.inspect.inspection import HUMAN
+from sst_graph.inspect.reasons import cut
 from sst_graph.report.chart import Chart
 from sst_graph.report.html import bullets, details, figure, grid, paragraph, section, text
 
@@ -26,17 +28,21 @@ _SIGMA_HEADS = ("σ rotation", "σ translation", "σ time offset")
 _SHOWN = ("drive", "vehicle", "date", "status", "reason", *_SIGMA_HEADS, "took")
 
 
-def summary_html(rows: Sequence[Row], vehicle_rows: Sequence[Row], vehicles: Sequence[Vehicle]) -> str:
+def summary_html(
+    rows: Sequence[Row], vehicle_rows: Sequence[Row], vehicles: Sequence[Vehicle], others: int = 0
+) -> str:
     """The page.
 
     Args:
         rows: of the drives, in the order of the page.
         vehicle_rows: of the vehicles, in the order of the page.
         vehicles: all of them.
+        others: how many drives of earlier runs were not given this time.
     """
     by_name = {one.name: one for one in vehicles}
     body = [
         _verdict(rows, vehicle_rows),
+        paragraph(others_line(others), "note") if others else "",
         _vehicles(vehicle_rows),
         _drifts([by_name[str(row["vehicle"])] for row in vehicle_rows]),
         _drives(rows),
@@ -62,6 +68,16 @@ def counts_line(rows: Sequence[Row]) -> str:
     return ", ".join(f"{count} {name}" for name, count in counts.most_common())
 
 
+def others_line(others: int) -> str:
+    """That results of drives that were not given this time count for nothing."""
+    them = _verb(others, "it is", "they are")
+    return (
+        f"{count_of(others, 'drive')} of earlier runs {_verb(others, 'was', 'were')} not given this time: "
+        f"{them} in no table and in no vehicle. Give all drives to have them in; those that are done are not "
+        "run again."
+    )
+
+
 def _verdict(rows: Sequence[Row], vehicle_rows: Sequence[Row]) -> str:
     counts = Counter(str(row["status"]) for row in rows)
     bars = "".join(
@@ -71,6 +87,7 @@ def _verdict(rows: Sequence[Row], vehicle_rows: Sequence[Row]) -> str:
     failed = [row for row in rows if not row["report"]]
     state = "ok" if counts["ok"] == len(rows) else "not_converged" if failed else "unobservable"
     reasons = Counter(_kind_of(row) for row in rows if row["status"] != "ok")
+    reasons.update("contradicts the other drives of its vehicle" for row in rows if row["contradicts"])
     wrong = [row for row in vehicle_rows if row["status"] != "ok"]
     return section(
         "verdict",
@@ -110,14 +127,14 @@ def _cost_line(rows: Sequence[Row]) -> str:
 
 
 def _kind_of(row: Row) -> str:
-    """A status and the part of its reason that drives have in common: no numbers, no name of the drive."""
-    reason = _MORE.sub("", str(row["reason"]))
+    """A status and what drives have in common of its own reason: no numbers, no name of the drive."""
+    reason = _MORE.sub("", own_reason(row))
     if row["report"]:
         reason = re.sub(rf"^{re.escape(str(row['drive']))}[^ ]*: ", "", reason)
-        return f"{row['status']}: {_NUMBER.sub('…', reason)}"[:_LONGEST_KIND]
+        return cut(f"{row['status']}: {_NUMBER.sub('…', reason)}", _LONGEST_KIND)
     words = reason.split(": found ", 1)
     last = words[0].rsplit("/", 1)[-1] if len(words) == 2 else ""
-    return f"{row['status']}: {f'{last}: found {words[1]}' if last else reason}"[:_LONGEST_KIND]
+    return cut(f"{row['status']}: {f'{last}: found {words[1]}' if last else reason}", _LONGEST_KIND)
 
 
 _LONGEST_KIND = 160
@@ -134,7 +151,7 @@ def _vehicles(rows: Sequence[Row]) -> str:
         lines.append(
             f'<tr><th scope="row">{link}</th><td>{_tag(row)}</td>'
             f'<td class="why">{text(str(row["reason"]))}</td><td class="num">{row["drives"]}</td>'
-            f'<td class="num">{row["without"]}</td>{_sigma_cells(row)}</tr>'
+            f'<td class="num">{_left_out(row)}</td>{_sigma_cells(row)}</tr>'
         )
     heads = ("vehicle", "status", "what happened", "drives", "not counted", *_SIGMA_HEADS)
     return section(
@@ -146,6 +163,11 @@ def _vehicles(rows: Sequence[Row]) -> str:
         ),
         _table("vehicles-table", heads, lines),
     )
+
+
+def _left_out(row: Row) -> int:
+    """Drives of a vehicle that do not count: without a result that can, or contradicting the others."""
+    return int(row["without"] or 0) + int(row["contradicting"] or 0)
 
 
 def _drives(rows: Sequence[Row]) -> str:
@@ -223,8 +245,8 @@ def _drifts(vehicles: Sequence[Vehicle]) -> str:
     ]
     note = (
         "The calibration at each drive by all drives of its stretch, against that of the first, along "
-        "the LiDAR's axes; the bands are one σ. Errors that all drives have in common do "
-        "not show."
+        "the LiDAR's axes; the bands are one σ. A line ends where the calibration changed. Errors that all "
+        "drives have in common do not show."
     )
     return section("drift", "Drift", paragraph(note, "note"), *blocks) if blocks else ""
 
@@ -241,6 +263,7 @@ def _charts(vehicle: Vehicle) -> list[str]:
     sigmas = np.sqrt([np.diag(one.covariance) for one in vehicle.drift]) * HUMAN
     span = (float(days[0]), float(days[-1]))
     unit = "days" if vehicle.dated else "drives"
+    stretches = _stretches(vehicle)
     shown = []
     for title, columns, label in (
         ("Rotation", [0, 1, 2], "deg"),
@@ -256,8 +279,19 @@ def _charts(vehicle: Vehicle) -> list[str]:
         )
         for k, axis in enumerate("xyz"[: len(columns)]):
             colour, name = "abc"[k], axis if len(columns) == 3 else ""
-            chart.band(days, values[:, k] - sigma[:, k], values[:, k] + sigma[:, k], colour)
-            chart.line(days, values[:, k], colour, name)
+            for number, part in enumerate(stretches):
+                at, middle, wide = days[part], values[part, k], sigma[part, k]
+                if len(at) > 1:
+                    chart.band(at, middle - wide, middle + wide, colour)
+                else:  # a band of no width would not show
+                    chart.line([*at, *at], [*(middle - wide), *(middle + wide)], colour)
+                chart.line(at, middle, colour, name if number == 0 else "")
             chart.dots(days, values[:, k], colour, titles=vehicle.drives)
         shown.append(figure(chart.svg(), title, ""))
     return shown
+
+
+def _stretches(vehicle: Vehicle) -> list[slice]:
+    """The drives between its changes."""
+    begins = [0, *(vehicle.drives.index(change.before) for change in vehicle.changes), len(vehicle.drives)]
+    return [slice(first, end) for first, end in pairwise(begins)]

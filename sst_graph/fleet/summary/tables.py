@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -74,9 +75,15 @@ def drive_rows(
     return [row for _, row in sorted(rows, key=lambda one: one[0])]
 
 
+def own_reason(row: Row) -> str:
+    """The reason of a drive's own result, without that it contradicts others."""
+    vehicle = re.escape(str(row["vehicle"]))
+    return re.sub(rf"^contradicts the other drives of {vehicle}: [^;]*(?:; |$)", "", str(row["reason"]))
+
+
 def vehicle_rows(vehicles: Sequence[Vehicle]) -> list[Row]:
     """A row a vehicle, what needs attention first."""
-    order = ("changed", "contradicted", "no_result", "ok")
+    order = ("changed", "contradicted", "no_result", "unobservable", "ok")
     rows: list[Row] = []
     for one in sorted(vehicles, key=lambda each: (order.index(each.status), each.name)):
         now = one.calibration

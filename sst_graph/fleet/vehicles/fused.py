@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.covariance.observability import ObservabilityConfig, weak_directions
 from sst_graph.errors import EstimationError
 from sst_graph.factors.errors import FactorError
 from sst_graph.files.strict_json import strict_json
@@ -17,11 +18,13 @@ from sst_graph.fleet.drives import Drive
 from sst_graph.fleet.record import Numbers, Record
 from sst_graph.fleet.vehicles.changes import Finding, Findings, find_changes
 from sst_graph.fleet.vehicles.walk import DriveEstimate, Smoothed, WalkConfig, smoothed
+from sst_graph.imports.records import VEHICLE_FORMAT
+from sst_graph.result import WeakDirection
 
 FloatArray = NDArray[np.float64]
-VehicleStatus = Literal["ok", "changed", "contradicted", "no_result"]
+VehicleStatus = Literal["ok", "unobservable", "changed", "contradicted", "no_result"]
 
-FORMAT = "sst-graph/vehicle"
+_LIMITS = ObservabilityConfig()
 VERSION = 1
 
 
@@ -59,7 +62,8 @@ class Vehicle:
     Attributes:
         name: of the vehicle.
         status: ``changed`` where a step was found, ``contradicted`` where only a drive contradicts the
-            others, ``no_result`` where no drive of it has a result that counts.
+            others, ``unobservable`` where all of them leave a direction open, ``no_result`` where no drive of
+            it has a result that counts.
         drives: names of those that count, in order.
         calibration: at the last of them, with what the drives have in common in its covariance; None without.
         days: of each of them, from the first.
@@ -67,6 +71,7 @@ class Vehicle:
         changes: steps.
         contradicting: drives that were left out, by name.
         without: drives that do not count, and why.
+        weak: what the calibration does not determine to within the limits, the weakest first.
         dated: whether all have a date; else their order counts, a day from each to the next.
     """
 
@@ -80,19 +85,25 @@ class Vehicle:
     contradicting: Mapping[str, Finding]
     without: Mapping[str, str]
     dated: bool
+    weak: tuple[WeakDirection, ...] = ()
 
     @property
     def reason(self) -> str:
         """One line, empty where nothing is wrong."""
         parts = [f"changed {change.words}" for change in self.changes]
         parts += [f"{name} contradicts the others: {one.words}" for name, one in self.contradicting.items()]
+        parts += [f"by all drives, {one.sentence}" for one in self.weak[:1]]
         if self.calibration is None:
             parts.append("no drive of it has a result that counts")
         return "; ".join(parts)
 
 
 def vehicle_of(
-    name: str, drives: Sequence[Drive], records: Mapping[str, Record], config: WalkConfig
+    name: str,
+    drives: Sequence[Drive],
+    records: Mapping[str, Record],
+    config: WalkConfig,
+    limits: ObservabilityConfig = _LIMITS,
 ) -> Vehicle:
     """Fuse the drives of one vehicle.
 
@@ -101,6 +112,7 @@ def vehicle_of(
     Args:
         drives: in the order of the list.
         records: by the name of the drive.
+        limits: of the standard deviations of a calibration that is ok.
     """
     counted, without = _counted(drives, records)
     dated = all(drive.day is not None for drive in counted)
@@ -120,7 +132,10 @@ def vehicle_of(
     changes = _changes(found, by_name)
     last = drift[-1]
     calibration = Smoothed(last.cTl, last.time_offset_s, last.covariance + last.common)
-    status: VehicleStatus = "changed" if changes else "contradicted" if found.contradicting else "ok"
+    weak = weak_directions(calibration.covariance, calibration.cTl, limits)
+    status: VehicleStatus = "unobservable" if weak else "ok"
+    if changes or found.contradicting:
+        status = "changed" if changes else "contradicted"
     return Vehicle(
         name,
         status,
@@ -132,6 +147,7 @@ def vehicle_of(
         found.contradicting,
         without,
         dated,
+        weak,
     )
 
 
@@ -139,8 +155,13 @@ def _without_result(name: str, without: Mapping[str, str]) -> Vehicle:
     return Vehicle(name, "no_result", (), (), None, (), (), {}, without, False)
 
 
-def vehicles_of(drives: Sequence[Drive], records: Mapping[str, Record], config: WalkConfig) -> list[Vehicle]:
-    """All vehicles, by name; drives of no known vehicle are left out."""
+def vehicles_of(
+    drives: Sequence[Drive],
+    records: Mapping[str, Record],
+    config: WalkConfig,
+    limits: ObservabilityConfig = _LIMITS,
+) -> list[Vehicle]:
+    """All vehicles, by name; drives of no known vehicle are left out; arguments as of :func:`vehicle_of`."""
     by_vehicle: dict[str, list[Drive]] = {}
     for drive in drives:
         if drive.vehicle:
@@ -148,7 +169,7 @@ def vehicles_of(drives: Sequence[Drive], records: Mapping[str, Record], config: 
     found = []
     for name, own in sorted(by_vehicle.items()):
         try:
-            found.append(vehicle_of(name, own, records, config))
+            found.append(vehicle_of(name, own, records, config, limits))
         except EstimationError as error:
             without = {drive.name: str(error) for drive in own}
             found.append(_without_result(name, without))
@@ -159,7 +180,7 @@ def vehicle_json(vehicle: Vehicle, records: Mapping[str, Record], config: WalkCo
     """The text of ``vehicles/NAME.json``."""
     now = vehicle.calibration
     document = {
-        "format": FORMAT,
+        "format": VEHICLE_FORMAT,
         "version": VERSION,
         "vehicle": vehicle.name,
         "status": vehicle.status,

@@ -15,6 +15,7 @@ from sst_graph.cli.inputs import calibration_settings
 from sst_graph.cli.messages import complain, mention
 from sst_graph.cli.options import SOURCE_DEFAULTS
 from sst_graph.cli.reading import check_options
+from sst_graph.data.source import recognized
 from sst_graph.errors import ConfigError, count_of
 from sst_graph.fleet import (
     BatchConfig,
@@ -29,7 +30,7 @@ from sst_graph.fleet import (
     with_vehicles,
     write_summary,
 )
-from sst_graph.fleet.summary.page import counts_line
+from sst_graph.fleet.summary.page import counts_line, others_line
 from sst_graph.reference import load_initial
 
 _MOST_SAID = 10
@@ -39,12 +40,13 @@ def run(args: argparse.Namespace) -> int:
     """Calibrate all drives that are not done yet, and write the summary of all."""
     config = _config(args)
     _check_passed_on(args)
-    drives = find_drives(args.drives, _at_least("--name-parts", args.name_parts, 1))
+    out = Place.of(args.out)
+    out = Place(os.path.abspath(out.url)) if out.is_local else out
+    drives = _but(out, find_drives(args.drives, _at_least("--name-parts", args.name_parts, 1)))
+    _say_if_a_drive(args.drives, drives)
     if args.vehicle_from is not None:
         drives = with_vehicles(drives, args.vehicle_from)
         _say_without_vehicle(drives)
-    out = Place.of(args.out)
-    out = Place(os.path.abspath(out.url)) if out.is_local else out
     _check_apart(drives, out)
     with open_batch(out, config.options), children_ended(), ProgressOnStderr() as told:
         records = run_batch(drives, out, config, told)
@@ -68,6 +70,7 @@ def _config(args: argparse.Namespace) -> BatchConfig:
         ),
         retries=_at_least("--retries", args.retries, 0),
         walk=_walk(args),
+        observability=calibration_settings(args).observability,
     )
 
 
@@ -105,11 +108,21 @@ def _passed_on(args: argparse.Namespace) -> tuple[str, ...]:
 
 
 def _check_passed_on(args: argparse.Namespace) -> None:
-    """Refuse at once what every drive would refuse."""
-    calibration_settings(args)
+    """Refuse at once what every drive would refuse; the settings are checked by now."""
     check_options(args)
     if args.init not in ("dataset", "none"):
         load_initial(Path(args.init), args.camera or str(SOURCE_DEFAULTS["camera"]))
+
+
+def _but(out: Place, drives: list[Drive]) -> list[Drive]:
+    """The drives without the batch's own folder, which may stand among them."""
+    if not out.is_local:
+        return drives
+    own = os.path.realpath(out.url)
+    left = [one for one in drives if not one.place.is_local or os.path.realpath(one.place.url) != own]
+    if not left:
+        raise ConfigError(f"{out}: found no drive beside this folder of the batch, expected at least one")
+    return left
 
 
 def _check_apart(drives: list[Drive], out: Place) -> None:
@@ -125,6 +138,17 @@ def _check_apart(drives: list[Drive], out: Place) -> None:
             raise ConfigError(
                 f"--out {out}: found the drive {drive.place} in it or around it, expected two places"
             )
+
+
+def _say_if_a_drive(what: str, drives: list[Drive]) -> None:
+    """Tell who gives one drive in the place of a folder of drives."""
+    place = Place.of(what)
+    if place.is_local and place.is_folder() and (kind := recognized(place.path)) is not None:
+        parts = ", ".join(drive.place.name for drive in drives[:3]) + (", ..." if len(drives) > 3 else "")
+        complain(
+            f"note: {what} looks like one drive ({kind}); what stands in it ({parts}) is taken for the "
+            "drives: name the folder above, or a pattern such as 'drives/*'"
+        )
 
 
 def _say_without_vehicle(drives: list[Drive]) -> None:
@@ -143,6 +167,8 @@ def _say(outcome: Outcome, out: Place) -> None:
         mention(f"{'':<15} and {len(wrong) - _MOST_SAID} more without result")
     for vehicle in [one for one in outcome.vehicles if one.status != "ok"][:_MOST_SAID]:
         mention(f"{'vehicle':<15} {vehicle.name}: {vehicle.reason}")
+    if outcome.others:
+        complain(f"note: {others_line(outcome.others)}")
     if "summary.parquet" not in outcome.names:
         complain("note: no Parquet without pyarrow: pip install 'sst-graph[fleet]'")
     mention(f"{'wrote':<15} {out}: {', '.join(outcome.names)}")
