@@ -78,7 +78,12 @@ class OccupancyTest:
         self._places: dict[int, _Places] = {}
 
     def add(self, number: int, scan: ScanFeatures, wTl: gtsam.Pose3) -> set[int]:
-        """The next scan, posed at ``wTl``; numbers of the earlier ones in which a speed changes by it."""
+        """The next scan, posed at ``wTl``; numbers of the earlier ones in which a speed changes by it.
+
+        A scan without labels shows no object, and takes none from its place: it is passed over.
+        """
+        if not scan.boundaries and len(scan.classes) and (scan.classes == int(SemanticClass.IGNORE)).all():
+            return set()
         here = self._insert(number, scan, wTl)
         self.shares[number] = {name: np.full(len(_HORIZONS_S), np.nan) for name in here.names}
         self.left[number] = {}

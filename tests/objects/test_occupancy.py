@@ -100,6 +100,21 @@ def test_labels_that_go_do_not_take_the_object_along() -> None:
         assert bool(test.speeds(4)) == found
 
 
+def test_scans_without_labels_between_take_nothing_from_its_place() -> None:
+    """Labels in every third scan: what drives away is found from one labelled scan to another."""
+    test = OccupancyTest()
+    for k in range(13):
+        corners = [np.array([15.0, -4.0, 0.5]), np.array([15.0 + 1.2 * k, 4.0, 0.5])]
+        whole = scan(k, 0.1, corners)
+        if k % 3:
+            some = np.random.default_rng(k).permutation(whole.boundaries[VEHICLE].lPs)[::10]
+            ignored = np.full(len(some), SemanticClass.IGNORE, np.uint8)
+            whole = replace(whole, boundaries={}, lPs=some, classes=ignored)
+        test.add(k, whole, pose(k, 0.1))
+    assert [set(test.speeds(k)) for k in (3, 6, 9)] == [{(VEHICLE, 1)}] * 3
+    assert not test.speeds(4)
+
+
 def test_what_cannot_move_is_left_alone() -> None:
     assert all(not found for found in seen(6, 12.0, c=BUILDING))
     # Scans two seconds apart tell nothing of an object either.
