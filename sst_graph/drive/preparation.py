@@ -90,8 +90,7 @@ class ScanFeatures:
         index: of its frame in the drive.
         stamp_ns: LiDAR-clock stamp.
         boundaries: boundary points of each class, without those towards the ground.
-        lPs, classes, offsets_s: (n, 3), (n,), (n,) a sample of its points of each class, of IGNORE, too [m],
-            [s].
+        lPs, classes, offsets_s: (n, 3), (n,), (n,) a sample of its labelled points [m], [s].
         depth_lPs, depth_offsets_s: points for depth of image features (all classes); none where image
             features are not tracked [m], [s].
         lower_edges: boundary points of each class towards the ground, of objects that have others too.
@@ -452,9 +451,9 @@ def boundary_count(scan: ScanFeatures, lower_edges: Collection[SemanticClass]) -
 
 
 def _sample(scan: Scan) -> NDArray[np.intp]:
-    """Evenly spread indices of at most ``SAMPLE_POINTS`` points of every class, 2 to 60 m away."""
+    """Evenly spread indices of at most ``SAMPLE_POINTS`` points of every known class, 2 to 60 m away."""
     square = np.einsum("ij,ij->i", scan.points, scan.points)
-    usable = (square > _SAMPLE_NEAR_M**2) & (square < _FAR_M**2)
+    usable = (square > _SAMPLE_NEAR_M**2) & (square < _FAR_M**2) & (scan.classes != SemanticClass.IGNORE)
     parts = [np.zeros(0, dtype=np.intp)]
     # Compared with plain ints: compared with NumPy's, all classes are converted to int64.
     for c in np.flatnonzero(np.bincount(scan.classes[usable])).tolist():

@@ -4,10 +4,6 @@ A dynamic object has left its place by then. That needs no track of the object, 
 vehicles, whose tracks break and join others'. An object that has just come into view is at its place later,
 and one that is about to leave was there before: the better of the two counts. Labels come and go, too: where
 a place is occupied by anything but ground, the object has not left it.
-
-A long vehicle that drives along itself is found again nearly everywhere, but not at its ends: an object is
-dynamic, too, where the place of one of its upright edges is free in one of the two scans: rays go on behind
-it, and nothing but ground is before it or beside.
 """
 
 from __future__ import annotations
@@ -21,7 +17,6 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sst_graph.drive.preparation import ScanFeatures
-from sst_graph.features.lidar_edges import Boundaries, Edge
 from sst_graph.odometry.lidar import MOVABLE_CLASSES
 from sst_graph.types import SemanticClass
 
@@ -43,15 +38,6 @@ _MAX_POINTS = 48
 """Points of an object that are looked up."""
 _MAX_INSIDE = 1000
 """Points of a class, beside its outlines, among which they are looked up (about)."""
-_DIRECTIONS = 240
-_EDGE_WIDTH = 2.0 * np.pi / (_DIRECTIONS - 1)
-"""Side points of an object within so many radians are one upright edge."""
-_MAX_EDGE_POINTS, _MIN_EDGE_POINTS = 8, 4
-"""Most points of an edge that are looked up, and fewest whose places are occupied or free."""
-_SIGHT_BIN = np.radians(1.0)
-"""Directions that are looked up together [rad]."""
-_BEHIND_M = 0.5
-"""A place is free where all that is seen about it but ground lies so far behind it [m]."""
 _SPEED_MPS = 0.6
 """Assumed speed of an object half way between the two shares [m/s]."""
 _MAX_SPEED_MPS = 30.0
@@ -68,13 +54,10 @@ class OccupancyTest:
     Attributes:
         shares: of each object of each scan, the share of its points found again, for each horizon (nan where
             no scan is that far away).
-        left: of each object of each scan, the largest share of the places of one of its upright edges that
-            are free in another scan; without those of which too little was seen.
     """
 
     def __init__(self) -> None:
         self.shares: dict[int, dict[ObjectName, FloatArray]] = {}
-        self.left: dict[int, dict[ObjectName, float]] = {}
         self._places: dict[int, _Places] = {}
 
     def add(self, number: int, scan: ScanFeatures, wTl: gtsam.Pose3) -> set[int]:
@@ -82,20 +65,16 @@ class OccupancyTest:
 
         A scan without labels shows no object, and takes none from its place: it is passed over.
         """
-        if not scan.boundaries and len(scan.classes) and (scan.classes == int(SemanticClass.IGNORE)).all():
+        if not scan.boundaries and not len(scan.classes):
             return set()
         here = self._insert(number, scan, wTl)
         self.shares[number] = {name: np.full(len(_HORIZONS_S), np.nan) for name in here.names}
-        self.left[number] = {}
         others = [self._nearest(number, scan.stamp_ns, seconds) for seconds in _HORIZONS_S]
         before = {other: self.speeds(other) for other in others if other is not None}
         for horizon, other in enumerate(others):
             if other is not None:
-                then = self._places[other]
-                for one, own, seen in ((number, here, then), (other, then, here)):
-                    self._set(one, horizon, own.found_in(seen))
-                    for name, share in own.left_in(seen).items():
-                        self.left[one][name] = max(share, self.left[one].get(name, 0.0))
+                self._set(number, horizon, here.found_in(self._places[other]))
+                self._set(other, horizon, self._places[other].found_in(here))
         return {other for other, speeds in before.items() if self.speeds(other) != speeds}
 
     def _insert(self, number: int, scan: ScanFeatures, wTl: gtsam.Pose3) -> _Places:
@@ -108,7 +87,7 @@ class OccupancyTest:
 
     def forget(self, before: int) -> None:
         """Drop all scans before one."""
-        for by_scan in (self.shares, self.left, self._places):
+        for by_scan in (self.shares, self._places):
             for number in [k for k in by_scan if k < before]:
                 del by_scan[number]
 
@@ -121,7 +100,7 @@ class OccupancyTest:
         for name, shares in self.shares.get(number, {}).items():
             known = [share for share in shares.tolist() if share == share]
             if known and shares[-1] == shares[-1]:  # not nan
-                least[name] = min(*known, 1.0 - self.left.get(number, {}).get(name, 0.0))
+                least[name] = min(known)
         return {name: _speed(share) for name, share in least.items() if share < _STATIC_SHARE}
 
     def _nearest(self, number: int, stamp_ns: int, seconds: float) -> int | None:
@@ -153,7 +132,6 @@ class _Places:
         stamp_ns: of the scan.
         names: of the objects.
         outlines: by class.
-        upright: points on the upright edges of objects, by class; each edge is an owner.
         trees: all points of a class in the world.
         scan, wTl: itself, and its pose.
     """
@@ -161,7 +139,6 @@ class _Places:
     stamp_ns: int
     names: tuple[ObjectName, ...]
     outlines: dict[SemanticClass, _Outlines]
-    upright: dict[SemanticClass, _Outlines]
     trees: dict[SemanticClass, cKDTree]
     scan: ScanFeatures
     wTl: gtsam.Pose3
@@ -169,21 +146,19 @@ class _Places:
     @classmethod
     def of(cls, scan: ScanFeatures, wTl: gtsam.Pose3) -> _Places:
         names: list[ObjectName] = []
-        outlines, upright, trees = {}, {}, {}
+        outlines, trees = {}, {}
         for c in [c for c in TESTED_CLASSES if c in scan.boundaries]:
             edges = [scan.boundaries[c], *([scan.lower_edges[c]] if c in scan.lower_edges else [])]
             lPs = np.concatenate([part.lPs for part in edges])
             objects = np.concatenate([part.objects for part in edges])
             names += [(c, int(n)) for n in np.unique(objects)]
             chosen = _some_of_each(objects, _MAX_POINTS)
-            outlines[c] = _Outlines.of(lPs[chosen], objects[chosen], wTl)
-            sides, which = _upright_edges(scan.boundaries[c])
-            some = _some_of_each(which, _MAX_EDGE_POINTS)
-            upright[c] = _Outlines.of(scan.boundaries[c].lPs[sides[some]], which[some], wTl)
+            reaches = np.maximum(_REACH_M, _REACH_RATIO * np.linalg.norm(lPs[chosen], axis=1))
+            outlines[c] = _Outlines(_moved(wTl, lPs[chosen]), reaches, objects[chosen])
             inside = scan.lPs[scan.classes == c]
             thin = inside[:: max(1, len(inside) // _MAX_INSIDE)]
             trees[c] = _tree(_moved(wTl, np.concatenate([lPs, thin])))
-        return cls(scan.stamp_ns, tuple(names), outlines, upright, trees, scan, wTl)
+        return cls(scan.stamp_ns, tuple(names), outlines, trees, scan, wTl)
 
     @cached_property
     def _anything(self) -> cKDTree | None:
@@ -205,71 +180,6 @@ class _Places:
             shares.update({(c, int(n)): float(share) for n, share in zip(numbers, found, strict=True)})
         return shares
 
-    def left_in(self, other: _Places) -> dict[ObjectName, float]:
-        """Share of the places of an upright edge that are free in another scan, the largest of each object's
-        edges; without objects of whose edges too little is seen there."""
-        left: dict[ObjectName, float] = {}
-        for c, upright in self.upright.items():
-            if not len(upright.owners):
-                continue
-            near = upright.near(other.trees[c]) if c in other.trees else np.zeros(len(upright.wPs), bool)
-            free = ~near
-            free[free] = other._sees_through(upright.wPs[free])
-            if free.any() and other._anything is not None:
-                near[free] = upright.take(free).near(other._anything)
-                free &= ~near
-            owners, which = np.unique(upright.owners, return_inverse=True)
-            known = np.bincount(which, near | free)
-            shares, enough = np.bincount(which, free) / np.maximum(known, 1.0), known >= _MIN_EDGE_POINTS
-            for owner, share in zip(owners[enough], shares[enough], strict=True):
-                name = (c, int(owner) // _DIRECTIONS)
-                left[name] = max(float(share), left.get(name, 0.0))
-        return left
-
-    @cached_property
-    def _sight(self) -> tuple[FloatArray, FloatArray]:
-        """Ranges of the nearest raised and of the farthest point in each direction [m]: inf and 0 where there
-        is none."""
-        raised = _RAISED[self.scan.classes]
-        rows, columns, ranges = _directions(self.scan.lPs)
-        nearest, farthest = np.full(_SIGHT, np.inf), np.zeros(_SIGHT)
-        np.minimum.at(nearest, (rows[raised], columns[raised]), ranges[raised])
-        np.maximum.at(farthest, (rows, columns), ranges)
-        return nearest, farthest
-
-    def _sees_through(self, wPs: FloatArray) -> NDArray[np.bool_]:
-        """(n,) whether rays about these places go on behind them, and all that they meet but ground."""
-        lPs = (wPs - self.wTl.translation()) @ self.wTl.rotation().matrix()
-        rows, columns, ranges = _directions(lPs)
-        around = np.arange(-1, 2)
-        near_rows = np.clip(rows[:, None, None] + around[:, None], 0, _SIGHT[0] - 1)
-        near_columns = (columns[:, None, None] + around) % _SIGHT[1]
-        nearest, farthest = (about[near_rows, near_columns] for about in self._sight)
-        behind = farthest.max(axis=(1, 2)) > ranges + _BEHIND_M
-        return np.asarray(behind & (nearest.min(axis=(1, 2)) > ranges + _BEHIND_M))
-
-
-_SIGHT = (round(np.pi / _SIGHT_BIN), round(2.0 * np.pi / _SIGHT_BIN))
-"""Cells of elevation and azimuth."""
-
-
-def _directions(lPs: FloatArray) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
-    """Cells of elevation and azimuth of points (n, 3), and their ranges [m]."""
-    x, y, z = lPs.T
-    across = np.hypot(x, y)
-    rows = ((np.arctan2(z, across) + 0.5 * np.pi) / _SIGHT_BIN).astype(np.intp)
-    columns = ((np.arctan2(y, x) + np.pi) / _SIGHT_BIN).astype(np.intp)
-    return np.minimum(rows, _SIGHT[0] - 1), np.minimum(columns, _SIGHT[1] - 1), np.hypot(across, z)
-
-
-def _upright_edges(boundaries: Boundaries) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Positions of the side points of objects, and for each the number of the upright edge that it is on:
-    points of one object in one direction."""
-    sides = np.flatnonzero(boundaries.edges == Edge.SIDE)
-    x, y, _ = boundaries.lPs[sides].T
-    directions = ((np.arctan2(y, x) + np.pi) / _EDGE_WIDTH).astype(np.intp)
-    return sides, boundaries.objects[sides] * _DIRECTIONS + directions
-
 
 @dataclass(frozen=True)
 class _Outlines:
@@ -280,18 +190,12 @@ class _Outlines:
     reaches_m: FloatArray
     owners: NDArray[np.intp]
 
-    @classmethod
-    def of(cls, lPs: FloatArray, owners: NDArray[np.intp], wTl: gtsam.Pose3) -> _Outlines:
-        """Points (n, 3) in the LiDAR frame [m]."""
-        reaches = np.maximum(_REACH_M, _REACH_RATIO * np.linalg.norm(lPs, axis=1))
-        return cls(_moved(wTl, lPs), reaches, owners)
-
     def take(self, chosen: NDArray[np.bool_]) -> _Outlines:
         return _Outlines(self.wPs[chosen], self.reaches_m[chosen], self.owners[chosen])
 
     def near(self, tree: cKDTree) -> NDArray[np.bool_]:
         """(n,) whether a point of a tree lies within reach."""
-        distances, _ = tree.query(self.wPs, distance_upper_bound=float(self.reaches_m.max(initial=0.0)))
+        distances, _ = tree.query(self.wPs, distance_upper_bound=float(self.reaches_m.max()))
         return np.asarray(distances <= self.reaches_m)
 
 
@@ -309,4 +213,4 @@ def _some_of_each(objects: NDArray[np.intp], most: int) -> NDArray[np.intp]:
     """Positions of at most ``most`` evenly spread entries of each number."""
     order = np.argsort(objects, kind="stable")
     parts = np.split(order, np.flatnonzero(np.diff(objects[order])) + 1)
-    return np.concatenate([order[:0], *(part[:: -(-len(part) // most)] for part in parts if len(part))])
+    return np.concatenate([part[:: -(-len(part) // most)] for part in parts if len(part)])
