@@ -19,10 +19,7 @@ _MEMORY_S = 0.6
 _MAX_DISTANCE_M = 0.15
 """Farthest that points of a static object lie from those of the older scan [m]."""
 _MIN_SHARE = 0.75
-"""Part of an object's points that have to lie within it, ..."""
-_MAX_MISSING_M = 1.1
-"""... and more of a long object's: what is missing is no longer than this of one evenly covered, a quarter of
-a car. A tram drives along itself, and nearly all of it is where another part of it was [m]."""
+"""Part of an object's points that have to lie within it."""
 _CELL_M = 0.4
 """Objects are separate where this much of the ground between them is empty [m]."""
 _VOXEL_M = 0.15
@@ -53,7 +50,10 @@ class StaticPoints:
 
 
 def on_static_objects(
-    wPs: FloatArray, others: FloatArray, max_distance_m: float = _MAX_DISTANCE_M
+    wPs: FloatArray,
+    others: FloatArray,
+    max_distance_m: float = _MAX_DISTANCE_M,
+    max_missing_m: float = np.inf,
 ) -> BoolArray:
     """(n,) whether points wPs (n, 3) in the world [m] belong to an object that is where points of another
     time, ``others`` (m, 3), are.
@@ -61,6 +61,8 @@ def on_static_objects(
     Args:
         max_distance_m: farthest that points of a static object lie from those of the other time; more where
             the poses are less certain [m].
+        max_missing_m: longest part of a static object that is not there [m]: a tram drives along itself, and
+            nearly all of it is where another part of it was.
     """
     if len(wPs) == 0 or len(others) == 0:
         return np.zeros(len(wPs), np.bool_)
@@ -71,7 +73,7 @@ def on_static_objects(
     near = np.isfinite(distance).astype(np.float64)
     total = np.bincount(labels[keys], minlength=labels.max() + 1)
     share = np.bincount(labels[keys], near, labels.max() + 1) / np.maximum(total, 1)
-    needed = np.maximum(_MIN_SHARE, 1.0 - _MAX_MISSING_M / np.maximum(_lengths(wPs, labels), 1e-9))
+    needed = np.maximum(_MIN_SHARE, 1.0 - max_missing_m / np.maximum(_lengths(wPs, labels), 1e-9))
     return np.asarray((share >= needed)[labels])
 
 

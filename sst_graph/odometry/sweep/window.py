@@ -60,6 +60,8 @@ errors are independent from cell to cell [m]."""
 _STATIC_M = 0.3
 """Farthest that points of a static object lie from those of another scan: twice odometry's, for points are
 not compensated yet [m]."""
+_MISSING_M = 1.1
+"""Longest part of a static object that is not found in another scan, a quarter of a car [m]."""
 _MIN_NORMAL_COSINE = 0.8
 """Surfaces are matched where the cosine between their normals is larger."""
 
@@ -187,7 +189,9 @@ class Window:
             # An object is static if it is where it is in the scan half a window away.
             other = k + len(scans) // 2 if k < len(scans) // 2 else k - len(scans) // 2
             kept = ~movable[k]
-            static = on_static_objects(world[k][movable[k]], world[other][movable[other]], _STATIC_M)
+            static = on_static_objects(
+                world[k][movable[k]], world[other][movable[other]], _STATIC_M, _MISSING_M
+            )
             kept[np.flatnonzero(movable[k])[static]] = True
             found.append(points[kept])
         return found
