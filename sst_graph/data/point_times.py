@@ -31,13 +31,13 @@ def seconds_after_stamp(values: NDArray[Any], stamp_ns: int) -> NDArray[np.float
     numbers = values.astype(np.int64 if whole else np.float64)
     finite = numbers[np.isfinite(numbers)]
     ends = np.array([finite.min(), finite.max()]) if len(finite) else numbers[:1]
-    usual, *others = _OF_WHOLE_NS if whole else _OF_FLOATS_NS
-    for unit_ns in (usual, *others):
+    units_ns = _OF_WHOLE_NS if whole else _OF_FLOATS_NS
+    for unit_ns in units_ns:
         for clock_ns in (0, stamp_ns):
             first, last = _read(ends[0], unit_ns, clock_ns), _read(ends[-1], unit_ns, clock_ns)
             if _SCAN_LASTS_S[0] <= last - first <= _SCAN_LASTS_S[1] and _farthest(first, last) <= FARTHEST_S:
                 return np.asarray(_read(numbers, unit_ns, clock_ns))
-    readings = [(usual, 0), (usual, stamp_ns), (1, stamp_ns)]
+    readings = [(units_ns[0], 0), (units_ns[0], stamp_ns), (1, stamp_ns)]
     nearest = min(readings, key=lambda r: max(_farthest(*(_read(end, *r) for end in ends)), FARTHEST_S))
     return np.asarray(_read(numbers, *nearest))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 
 import gtsam
@@ -11,7 +12,7 @@ from sst_graph.factors.camera import PinholeCamera
 from sst_graph.types import CameraImage, Frame, GroundTruth, Scan, Source
 
 
-class SourceView:
+class SourceView(ABC):
     """What a view of a source passes on; deriving from it and giving frames, and those scans or images
     that differ, makes a :class:`sst_graph.types.Source` that reads the last two separately."""
 
@@ -55,9 +56,9 @@ class SourceView:
     def __len__(self) -> int:
         return len(self.source)
 
+    @abstractmethod
     def __getitem__(self, position: int) -> Frame:
         """Frame at a position; IndexError as the source's own."""
-        raise NotImplementedError
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[position] for position in range(len(self)))

@@ -53,7 +53,7 @@ def on_static_objects(
     wPs: FloatArray,
     others: FloatArray,
     max_distance_m: float = _MAX_DISTANCE_M,
-    max_missing_m: float = np.inf,
+    max_missing_m: float | None = None,
 ) -> BoolArray:
     """(n,) whether points wPs (n, 3) in the world [m] belong to an object that is where points of another
     time, ``others`` (m, 3), are.
@@ -61,8 +61,8 @@ def on_static_objects(
     Args:
         max_distance_m: farthest that points of a static object lie from those of the other time; more where
             the poses are less certain [m].
-        max_missing_m: longest part of a static object that is not there [m]: a tram drives along itself, and
-            nearly all of it is where another part of it was.
+        max_missing_m: longest part of a static object that is not there [m], or None for any: a tram drives
+            along itself, and nearly all of it is where another part of it was.
     """
     if len(wPs) == 0 or len(others) == 0:
         return np.zeros(len(wPs), np.bool_)
@@ -73,8 +73,10 @@ def on_static_objects(
     near = np.isfinite(distance).astype(np.float64)
     total = np.bincount(labels[keys], minlength=labels.max() + 1)
     share = np.bincount(labels[keys], near, labels.max() + 1) / np.maximum(total, 1)
-    needed = np.maximum(_MIN_SHARE, 1.0 - max_missing_m / np.maximum(_lengths(wPs, labels), 1e-9))
-    return np.asarray((share >= needed)[labels])
+    static = share >= _MIN_SHARE
+    if max_missing_m is not None:
+        static &= (1.0 - share) * _lengths(wPs, labels) <= max_missing_m
+    return np.asarray(static[labels])
 
 
 def _lengths(wPs: FloatArray, labels: NDArray[np.intp]) -> FloatArray:
