@@ -162,11 +162,12 @@ def _support(problem: JointProblem, *states: State) -> list[float]:
 
 
 def _finding(name: str, value: float, steps: FloatArray, threshold: float) -> ParameterTest | None:
-    """The test of one parameter by its steps (SAMPLES,); None where too few half-samples have one."""
+    """The test of one parameter by its steps (SAMPLES,) from the estimate to the half-samples; None where too
+    few of these have one."""
     known = steps[np.isfinite(steps)]
     if len(known) < FEWEST:
         return None
-    sigma = max(float(known.std(ddof=1)), 1e-12) * few_objects_factor(len(known), threshold)
+    sigma = max(float(np.sqrt(np.mean(known**2))), 1e-12) * few_objects_factor(len(known), threshold)
     return ParameterTest(ASSUMPTIONS[name], value, sigma, abs(value) > threshold * sigma)
 
 

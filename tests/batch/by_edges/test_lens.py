@@ -7,12 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from stored import simulated
 from streets import LENS_STREET as STREET
 
 from sst_graph import CalibrationConfig, calibrate
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.batch.assumption_tests import ParameterTest
+from sst_graph.batch.by_edges import lens
+from sst_graph.batch.by_edges.covariance import SAMPLES
 from sst_graph.batch.by_edges.lens import MATTERS_SIGMAS, LensTest, lens_steps
 from sst_graph.batch.by_edges.optimum import START_KERNELS_PX
 from sst_graph.batch.by_edges.parts import thinned
@@ -21,11 +24,13 @@ from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.drive.preparation import Drive
-from sst_graph.graph.outer_loop import solve_joint
+from sst_graph.graph.outer_loop import JointProblem, solve_joint
 from sst_graph.graph.state import State
 from sst_graph.simulator import SimulationConfig
-from sst_graph.stepwise import run_to_end
+from sst_graph.stepwise import Stepwise, run_to_end
 from sst_graph.types import Guess
+
+FloatArray = NDArray[np.float64]
 
 SIGMAS = np.array([*np.radians([0.1] * 3), 0.02, 0.02, 0.02, 0.005])
 COVARIANCE = np.diag(SIGMAS**2)
@@ -65,6 +70,26 @@ def test_a_wrong_principal_point_is_named_with_its_size(drive: Drive) -> None:
     focal, step = drive.camera.fx, found.step
     assert step is not None and abs(step[2]) == pytest.approx(8.0 / focal, rel=0.4)
     np.testing.assert_allclose(np.diag(found.covariance), step**2)
+
+
+def test_half_samples_beside_the_estimate_contradict_no_lens(
+    drive: Drive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same wrong principal point; but every half-sample finds the right one again. Then the data have two
+    answers, and tell nothing about it."""
+
+    def all_right_again(
+        problem: JointProblem, start: State, objects: object
+    ) -> Stepwise[tuple[FloatArray, dict[str, FloatArray]]]:
+        yield 1
+        steps = {name: -value + 0.1 * (-1.0) ** np.arange(SAMPLES) for name, value in start.nuisances.items()}
+        return np.zeros((SAMPLES, 7)), steps
+
+    wrong = replace(drive, camera=replace(drive.camera, cx=drive.camera.cx - 8.0))
+    monkeypatch.setattr(lens, "half_sample_steps", all_right_again)
+    found = {each.assumption.name: each for each in examined(wrong).findings}["cx"]
+    assert found.value == pytest.approx(8.0, abs=2.0) and found.sigma > 0.9 * found.value
+    assert not found.contradicted
 
 
 @pytest.mark.slow
