@@ -6,7 +6,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from sst_graph.batch.config import CalibrationConfig
-from sst_graph.diagnosis import Finding, Fit, Fitter, likely_causes, mirror, other_camera, preflight
+from sst_graph.covariance.considered import AssumptionConfig
+from sst_graph.diagnosis import (
+    Finding,
+    Fit,
+    Fitter,
+    likely_causes,
+    mirror,
+    other_camera,
+    preflight,
+    uncalibrated,
+)
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
 from sst_graph.graph.matching import Tracks
@@ -34,7 +44,8 @@ _SCANS, _CANDIDATES = 6, 160
 def with_causes(
     result: CalibrationResult, drives: Sequence[Drive], guess: Guess, config: CalibrationConfig
 ) -> CalibrationResult:
-    """The result with what is probably wrong with the data as its first reasons; with any, it is not ok."""
+    """The result with what is probably wrong with the data as its first reasons; with any, it is not ok. What
+    may be wrong and does not show is a remark."""
     by_labels = config.method not in ("motion", "edges", "both")
     found = preflight(drives, guess, config.classes if by_labels else ())
     estimated = bool(result.frames_used)
@@ -43,10 +54,19 @@ def with_causes(
         found = () if camera is None else (camera,)
     if not found and config.find_causes and config.method == "joint":
         found = _suspected(result, drives, guess, config)
+    if estimated and _relies_on_principal_point(config.assumptions):
+        remark = uncalibrated(result.camera)
+        result = result if remark is None else replace(result, reasons=(*result.reasons, remark.sentence))
     if not found:
         return result
     reasons = (*(finding.sentence for finding in found), *result.reasons)
     return replace(result, status="not_converged" if estimated else result.status, reasons=reasons)
+
+
+def _relies_on_principal_point(assumptions: AssumptionConfig) -> bool:
+    """Whether it is neither estimated nor said how far it may be off."""
+    usual, estimated = AssumptionConfig(), dict(assumptions.estimated)
+    return not any(name in estimated or assumptions.sigma(name) > usual.sigma(name) for name in ("cx", "cy"))
 
 
 def _suspected(

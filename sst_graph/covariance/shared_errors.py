@@ -58,9 +58,13 @@ def with_estimate(steps: FloatArray) -> NDArray[np.bool_]:
 def spread_covariance(steps: FloatArray, others: FloatArray | None = None) -> FloatArray:
     """(n, n) covariance by the steps (k, n) of half-samples; 0 of fewer than :data:`FEWEST`.
 
-    The inverse of a sample covariance is too large on average: by (k - 1) / (k - 2 - n), of k samples in n
-    dimensions (Hartlap, Simon and Schneider, Astronomy & Astrophysics 464, 2007). With that factor the
-    mean of the NEES is right.
+    Deviations are those from the estimate, not from the half-samples' mean (McCarthy, Pseudo-replication:
+    half samples, 1969): where all of them lie to one side of it, they have met other edges, or it has not
+    converged.
+
+    The inverse of a sample covariance is too large on average: by k / (k - 1 - n), of k samples in n
+    dimensions about a given mean (Hartlap, Simon and Schneider, Astronomy & Astrophysics 464, 2007). With
+    that factor the mean of the NEES is right.
 
     Args:
         others: (k, n) steps of another camera's estimate by the same half-samples: the covariance of the two.
@@ -70,6 +74,4 @@ def spread_covariance(steps: FloatArray, others: FloatArray | None = None) -> Fl
     k, size = int(known.sum()), steps.shape[1]
     if k < FEWEST:
         return np.zeros((size, size))
-    a, b = steps[known], others[known]
-    cross = (a - a.mean(axis=0)).T @ (b - b.mean(axis=0)) / (k - 1)
-    return np.asarray(cross * (k - 1) / (k - 2 - size))
+    return np.asarray(steps[known].T @ others[known] / (k - 1 - size))

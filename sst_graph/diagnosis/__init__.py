@@ -7,9 +7,10 @@ that may be wrong, among them changes of the data that would make the labels agr
 
 from __future__ import annotations
 
+from sst_graph.diagnosis.cameras import uncalibrated
 from sst_graph.diagnosis.causes import likely_causes, mirror, preflight
 from sst_graph.diagnosis.finding import Finding
 from sst_graph.diagnosis.fit import Fit, Fitter
 from sst_graph.diagnosis.poses import other_camera
 
-__all__ = ["Finding", "Fit", "Fitter", "likely_causes", "mirror", "other_camera", "preflight"]
+__all__ = ["Finding", "Fit", "Fitter", "likely_causes", "mirror", "other_camera", "preflight", "uncalibrated"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from sst_graph.data.images import DARK
 from sst_graph.diagnosis.finding import Finding
 from sst_graph.drive.preparation import Drive
@@ -12,6 +14,8 @@ _FAR = 1.4
 """A principal point off the middle by this factor, in both directions alike, is that of another image size:
 lenses and sensors are centred within a few per cent, and a crop seldom cuts width and height alike."""
 _ALIKE = 1.25
+_AT_MIDDLE_PX = 0.5
+"""Half of the size, of the size less 1, and either rounded, are the middle [px]."""
 
 
 def image_size(camera: PinholeCamera) -> Finding | None:
@@ -34,6 +38,21 @@ def image_size(camera: PinholeCamera) -> Finding | None:
         f"the pictures are {size} the size the intrinsics were made for",
         f"cx = {camera.cx:.0f} of {camera.width} px, cy = {camera.cy:.0f} of {camera.height} px",
         f"scale fx, fy, cx and cy by that ratio (about {scale:.2g}), or give pictures and masks at full size",
+    )
+
+
+def uncalibrated(camera: PinholeCamera) -> Finding | None:
+    """A principal point in the very middle of the picture, as of a data sheet. It may be right; those of
+    real cameras are some pixels beside it."""
+    off_x, off_y = camera.cx - 0.5 * (camera.width - 1), camera.cy - 0.5 * (camera.height - 1)
+    if max(abs(off_x), abs(off_y)) > _AT_MIDDLE_PX:
+        return None
+    turn_deg = math.degrees(1.0 / camera.fy)
+    return Finding(
+        "the principal point is the middle of the picture, as where a camera was not calibrated",
+        f"cx = {camera.cx:g} of {camera.width} px, cy = {camera.cy:g} of {camera.height} px; each pixel that "
+        f"it is off turns the result by {turn_deg:.2g} deg, beyond the sigmas",
+        "if so, calibrate it, or say how far it may be off: --set assumptions.cx=8 --set assumptions.cy=8",
     )
 
 

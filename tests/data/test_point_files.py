@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from checks.fuzz_layouts import HEADERS, npy_of
+from sst_graph.data.arrays import read_points
 from sst_graph.data.point_files import read_cloud
 from sst_graph.data.point_files.pcd import unpack_lzf
 from sst_graph.errors import DataError
@@ -128,6 +129,33 @@ def test_times_that_are_all_0_are_none(tmp_path: Path) -> None:
         np.savez(tmp_path / "a.npz", **xyz, time=values)
         used = np.array([True, False, True])
         assert read_cloud(tmp_path / "a.npz").offsets_s(1_317_042_145_000_000_000, used) is None
+
+
+@pytest.mark.parametrize(
+    ("extra", "order"),
+    [
+        *((extra, order) for extra in (-1, 0, 1, 2) for order in ("ring by ring", "firing by firing")),
+        *((extra, "shuffled") for extra in (-1, 0, 1)),
+    ],
+)
+def test_a_bin_says_how_many_values_a_point_has(tmp_path: Path, extra: int, order: str) -> None:
+    """Neighbours have alike azimuths under the right number only. The size fits every number here."""
+    rng = np.random.default_rng(3)
+    rings, firings, half = 16, 900, np.radians(45.0)
+    azimuths, ring = np.meshgrid(np.linspace(-half, half, firings), np.arange(rings))
+    ranges = rng.uniform(5.0, 40.0, (rings, 1)) + rng.uniform(0.0, 1.0, (rings, firings))
+    columns = [ranges * np.cos(azimuths), ranges * np.sin(azimuths), 0.03 * ranges * (ring - 8)]
+    columns += [rng.integers(0, 255, ranges.shape), ring, np.linspace(0.0, 0.1, firings) * np.ones_like(ring)]
+    grid = np.stack(columns[: 4 + extra], axis=-1).astype("<f4")
+    rows = (grid if order == "ring by ring" else grid.transpose(1, 0, 2)).reshape(-1, 4 + extra)
+    if order == "shuffled":
+        rows = rng.permutation(rows)
+    assert rows.size % 60 == 0
+    (tmp_path / "a.bin").write_bytes(rows.tobytes())
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.bin").points(), rows[:, :3])
+    points, intensities = read_points(tmp_path / "a.bin")
+    np.testing.assert_array_equal(points, rows[:, :3])
+    np.testing.assert_array_equal(intensities, rows[:, 3] if extra >= 0 else np.zeros(len(rows)))
 
 
 # --- broken files -----------------------------------------------------------------------------------------

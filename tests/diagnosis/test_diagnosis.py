@@ -15,9 +15,12 @@ from stored import simulated
 
 from sst_graph import CalibrationConfig, calibrate
 from sst_graph.batch.calibrate import prepare_drives, scan_hashes
+from sst_graph.batch.causes import with_causes
+from sst_graph.batch.method_estimate import guess_as_result
+from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.diagnosis import Fit, other_camera, preflight
-from sst_graph.diagnosis.cameras import image_size
+from sst_graph.diagnosis.cameras import image_size, uncalibrated
 from sst_graph.diagnosis.clocks import stamps, two_clocks
 from sst_graph.diagnosis.hypotheses import best_hypothesis
 from sst_graph.diagnosis.poses import wrong_start
@@ -28,6 +31,7 @@ from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.mask_shift import contour_profiles, mask_shift
 from sst_graph.inspect.reasons import short_reason
 from sst_graph.odometry.sweep import SweepDecision, SweptSource, with_sweep
+from sst_graph.result import FrameId
 from sst_graph.simulator import SimulationConfig
 from sst_graph.sweep_timing import SweepTiming
 from sst_graph.types import NO_PICTURE, Guess, Scan, SemanticClass, Source
@@ -331,6 +335,32 @@ def test_a_crop_is_no_other_size(crop: float) -> None:
     height = round(375 * (1.0 - crop))
     camera = PinholeCamera(721.0, 721.0, 609.6, 172.9 - 375 * crop, 1242, height)
     assert image_size(camera) is None
+
+
+@pytest.mark.parametrize("middle", [(621.0, 187.5), (620.5, 187.0), (621.0, 187.0)])
+def test_a_principal_point_of_a_data_sheet(middle: tuple[float, float]) -> None:
+    finding = uncalibrated(PinholeCamera(721.0, 721.0, *middle, 1242, 375))
+    assert finding is not None and "turns the result by 0.079 deg" in finding.evidence
+    assert uncalibrated(PinholeCamera(721.0, 721.0, middle[0], 183.0, 1242, 375)) is None
+
+
+def test_it_is_a_remark_unless_it_is_said_how_far_it_may_be_off() -> None:
+    """The status stays, and other reasons stay before it."""
+    drives = prepare_drives([swept(drive())], CalibrationConfig())
+    guess = Guess(drive().nominal, 0.0)
+    found = guess_as_result(drives, guess, CalibrationConfig(), "first")
+    middle = PinholeCamera(721.0, 721.0, 621.0, 187.5, 1242, 375)
+    result = replace(found, camera=middle, status="ok", frames_used=(FrameId("street", 0),))
+
+    def reasons(**assumptions: object) -> tuple[str, ...]:
+        config = CalibrationConfig(method="edges", assumptions=AssumptionConfig(**assumptions))
+        said = with_causes(result, drives, guess, config)
+        assert said.status == "ok" and said.reasons[0] == "first"
+        return said.reasons[1:]
+
+    (remark,) = reasons()
+    assert remark.startswith("the principal point is the middle of the picture")
+    assert reasons(cy=8.0) == reasons(estimate=("cx=5",)) == ()
 
 
 @pytest.mark.parametrize(("scale", "name"), [(0.5, "half"), (2.0, "twice"), (0.25, "about 0.26 times")])

@@ -7,7 +7,8 @@ estimate over its deviation decides (Wald), by Student's t with one degree of fr
 half-samples.
 
 A lens that is contradicted is a reason against the estimate where it matters: where the estimate moves
-farther than it is known when the lens is free. Where it moves less far, that step is added to the covariance.
+farther than it is known when the contradicted parameters are free. Where it moves less far, that step is
+added to the covariance.
 
 An estimate by labels is tested, too, by edges of some of its frames: those know the principal point several
 times as well as the outlines of a few vehicles.
@@ -15,6 +16,7 @@ times as well as the outlines of a few vehicles.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -39,6 +41,7 @@ from sst_graph.objects.tracks import ObjectId
 from sst_graph.stepwise import Stepwise, run_to_end
 from sst_graph.types import Guess
 
+_LOG = logging.getLogger(__name__)
 FloatArray = NDArray[np.float64]
 
 MATTERS_SIGMAS = 2.0
@@ -65,7 +68,8 @@ class LensTest:
 
     Attributes:
         findings: the most contradicted first; none where nothing was tested.
-        step: (7,) from the estimate to that with the lens free [rad, m, s].
+        step: (7,) from the estimate to that with the contradicted parameters free [rad, m, s]; None where
+            none is.
     """
 
     findings: tuple[ParameterTest, ...] = ()
@@ -79,9 +83,7 @@ class LensTest:
     @property
     def covariance(self) -> FloatArray:
         """(7, 7) what a contradicted lens adds."""
-        if self.step is None or not self.contradicted:
-            return np.zeros((7, 7))
-        return np.outer(self.step, self.step)
+        return np.zeros((7, 7)) if self.step is None else np.outer(self.step, self.step)
 
     def reasons(self, covariance: FloatArray) -> tuple[str, ...]:
         """A sentence where a contradicted lens matters to an estimate of a covariance (7, 7)."""
@@ -93,19 +95,18 @@ class LensTest:
 
     def remarks(self, covariance: FloatArray) -> tuple[str, ...]:
         """A sentence where it is contradicted and does not matter."""
-        if not self.contradicted or self._matters(covariance):
+        if self.step is None or self._matters(covariance):
             return ()
-        assert self.step is not None
         figures = ", ".join(each.assumption.figure(each.value, each.sigma) for each in self.contradicted)
         degrees, metres = (float(np.linalg.norm(self.step[own])) for own in (slice(0, 3), slice(3, 6)))
         return (
-            f"the lens is a little off, and the sigmas cover it: {figures}; with the lens free the "
-            f"estimate moves by {np.degrees(degrees):.2f} deg, {100.0 * metres:.1f} cm and "
+            f"the lens is a little off, and the sigmas cover it: {figures}; with these free the estimate "
+            f"moves by {np.degrees(degrees):.2f} deg, {100.0 * metres:.1f} cm and "
             f"{1e3 * self.step[6]:+.1f} ms",
         )
 
     def _matters(self, covariance: FloatArray) -> bool:
-        if self.step is None or not self.contradicted:
+        if self.step is None:
             return False
         return bool((np.abs(self.step) > MATTERS_SIGMAS * np.sqrt(np.diag(covariance))).any())
 
@@ -119,18 +120,16 @@ def lens_steps(
     """Estimate the parameters of the lens that are held, and test them; step by step.
 
     Args:
-        problem: that was solved.
+        problem: that was solved, with a prior that holds under any lens.
         state: its estimate.
         objects: tracks of each drive's objects.
     """
-    graph = problem.config.graph
-    estimated = dict(named_sigmas(graph.estimate))
+    estimated = dict(named_sigmas(problem.config.graph.estimate))
     names = [name for name, each in ASSUMPTIONS.items() if each.by_edges and name not in estimated]
     if not config.test or not names:
         return LensTest()
-    graph = replace(graph, estimate=(*graph.estimate, *names))
-    free = replace(problem, config=replace(problem.config, graph=graph))
-    start = replace(state, nuisances={**state.nuisances, **dict.fromkeys(names, 0.0)})
+    # 1. All parameters free, and how far half-samples are from there.
+    free, start = _with_free(problem, state, names)
     try:
         wide = yield from solution_steps(free, start, START_KERNELS_PX)
         found = yield from _near(free, wide.state)
@@ -142,7 +141,21 @@ def lens_steps(
     _, steps = yield from half_sample_steps(free, found, objects)
     findings = [_finding(name, found.nuisances[name], steps[name], config.threshold) for name in names]
     known = sorted((each for each in findings if each is not None), key=lambda each: -each.score)
-    return LensTest(tuple(known), difference(state, found))
+    # 2. What those that are contradicted do to the estimate, the others held.
+    wrong = [each.assumption.name for each in known if each.contradicted]
+    if wrong and len(wrong) < len(names):
+        try:
+            found = yield from _near(*_with_free(problem, state, wrong))
+        except EstimationError:
+            _LOG.info("the lens: no solution with %s alone", ", ".join(wrong))
+    return LensTest(tuple(known), difference(state, found) if wrong else None)
+
+
+def _with_free(problem: JointProblem, state: State, names: Sequence[str]) -> tuple[JointProblem, State]:
+    """The problem with some more parameters as unknowns, and a state where they are 0."""
+    graph = replace(problem.config.graph, estimate=(*problem.config.graph.estimate, *names))
+    start = replace(state, nuisances={**state.nuisances, **dict.fromkeys(names, 0.0)})
+    return replace(problem, config=replace(problem.config, graph=graph)), start
 
 
 def _near(problem: JointProblem, start: State) -> Stepwise[State]:
@@ -162,11 +175,12 @@ def _support(problem: JointProblem, *states: State) -> list[float]:
 
 
 def _finding(name: str, value: float, steps: FloatArray, threshold: float) -> ParameterTest | None:
-    """The test of one parameter by its steps (SAMPLES,); None where too few half-samples have one."""
+    """The test of one parameter by its steps (SAMPLES,) from the estimate to the half-samples; None where too
+    few of these have one."""
     known = steps[np.isfinite(steps)]
     if len(known) < FEWEST:
         return None
-    sigma = max(float(known.std(ddof=1)), 1e-12) * few_objects_factor(len(known), threshold)
+    sigma = max(float(np.sqrt(np.mean(known**2))), 1e-12) * few_objects_factor(len(known), threshold)
     return ParameterTest(ASSUMPTIONS[name], value, sigma, abs(value) > threshold * sigma)
 
 
@@ -185,6 +199,6 @@ def lens_beside_labels(problem: CalibrationProblem, state: State) -> tuple[Param
     calibration, offsets_s = some
     clocks = tuple(offsets_s[: len(state.time_offsets_s)])
     held = State(state.cTl, clocks, nuisances=dict(state.nuisances))
-    edges = edges_problem(calibration, None, LabelEstimate(held, True)).whole
-    found = run_to_end(lens_steps(edges, held, calibration.objects, problem.config.assumptions))
+    edges = edges_problem(calibration, None, LabelEstimate(held, True))
+    found = run_to_end(lens_steps(edges.with_any_lens, held, calibration.objects, problem.config.assumptions))
     return tuple(each for each in found.findings if each.assumption.name in _BESIDE_LABELS)

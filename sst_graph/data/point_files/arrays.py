@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.data.arrays import MAX_POINTS
+from sst_graph.data.arrays import MAX_POINTS, float_columns
 from sst_graph.data.point_files.cloud import MAX_POINT_BYTES, Cloud, check_count, cloud_of, structured_fields
 from sst_graph.errors import DataError, count_of, first_line
 
@@ -39,15 +39,14 @@ _BROKEN = (
 
 
 def read_bin(data: bytes, path: Path) -> Cloud:
-    """x y z intensity in float32 little-endian, as in KITTI.
+    """As :func:`~sst_graph.data.arrays.float_columns`; what is behind the intensity is left out, for nothing
+    says what it is.
 
     Raises:
         DataError: a truncated file.
     """
-    if len(data) % 16:
-        raise DataError(path, count_of(len(data), "byte"), "a multiple of 16 (x y z intensity in float32)")
-    values = np.frombuffer(data, "<f4").reshape(-1, 4)
-    return cloud_of(path, {name: values[:, k] for k, name in enumerate(_COLUMNS)})
+    values = float_columns(data, path)
+    return cloud_of(path, {name: values[:, k] for k, name in enumerate(_COLUMNS[: values.shape[1]])})
 
 
 def read_npy(data: bytes, path: Path) -> Cloud:

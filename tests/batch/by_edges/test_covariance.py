@@ -73,6 +73,12 @@ def test_the_nees_of_a_spread_is_seven_on_average() -> None:
     assert not spread_covariance(np.ones((FEWEST - 1, 7))).any()
 
 
+def test_half_samples_beside_the_estimate_are_far_from_it() -> None:
+    """All of them 10 sigma to one side: the estimate is another optimum, and as uncertain as that."""
+    steps = np.random.default_rng(9).normal(10.0, 1.0, (SAMPLES, 1))
+    assert np.sqrt(spread_covariance(steps)[0, 0]) == pytest.approx(10.0, rel=0.1)
+
+
 @pytest.fixture(scope="module")
 def drive() -> Drive:
     config = CalibrationConfig(method="edges", decide_sweep=False)
