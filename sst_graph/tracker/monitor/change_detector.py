@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sst_graph.factors.robust import RobustKernel
+from sst_graph.graph.matching import PairMatches
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.monitor.confirmation import (
     DETECTABLE_OFFSET_S,
@@ -26,6 +27,7 @@ from sst_graph.tracker.monitor.statistic import (
     FRAMES,
     ChangeStatistic,
     ComparedEstimate,
+    Comparison,
     EstimateCovariance,
 )
 from sst_graph.tracker.start.first_estimate import StartGuess
@@ -141,7 +143,8 @@ class ChangeDetector:
         """
         if not self.config.enabled or self.refused_starts >= _MAX_REFUSED_STARTS:
             return ""
-        value = self._disagreement(estimate, self.matcher.window.dynamics.recently_moving())
+        moving = self.matcher.window.dynamics.recently_moving()
+        value = self._disagreement(estimate, moving, self.start_threshold)
         if value <= self.start_threshold:
             return ""
         self.refused_starts += 1
@@ -165,7 +168,8 @@ class ChangeDetector:
     def confirm_at_end(self, estimate: ComparedEstimate) -> None:
         """The frames of the window confirm the estimate where no part of them contradicts it."""
         moving = self.matcher.window.dynamics.recently_moving()
-        if not self.start_unconfirmed and self._disagreement(estimate, moving) <= self.config.chi2:
+        chi2 = self.config.chi2
+        if not self.start_unconfirmed and self._disagreement(estimate, moving, chi2) <= chi2:
             self.confirmation.begin()
 
     def start_is_over(self, scan: int) -> bool:
@@ -173,32 +177,74 @@ class ChangeDetector:
         return scan - self._start_scan >= self.warm_up_scans or self.refused_starts >= _MAX_REFUSED_STARTS
 
     def _confirm_start(self, estimate: ComparedEstimate, moving: Collection[int], threshold: float) -> None:
-        if self.start_unconfirmed and self._disagreement(estimate, moving) <= threshold:
+        if self.start_unconfirmed and self._disagreement(estimate, moving, threshold) <= threshold:
             self.refused_starts, self.start_unconfirmed = 0, False
 
-    def _disagreement(self, estimate: ComparedEstimate, moving: Collection[int]) -> float:
+    def _disagreement(self, estimate: ComparedEstimate, moving: Collection[int], threshold: float) -> float:
         """Largest statistic of a part of the frames that an estimate was made of, against that estimate.
 
-        The parts are its first ones, its last ones, and any few in a row.
+        The parts are its first ones, its last ones, and any few in a row. An object that alone takes a part
+        past the threshold, while the others in it would have shown what it shows, is wrong itself: it is left
+        out.
         """
         pairs = self.matcher.pairs_at(estimate.point, sorted(estimate.scans), _KERNEL)
-        scores = [
-            self.matcher.linearized({scan: pairs[scan]}, estimate.point, moving) for scan in sorted(pairs)
-        ]
-        n = len(scores)
+        out = set(moving)
+        while True:
+            value, scans = self._largest_of_parts(pairs, estimate, out)
+            if value <= threshold:
+                return value
+            part = {scan: pairs[scan] for scan in scans}
+            odd = self._odd_one_out(part, estimate, out, threshold)
+            if odd is None:
+                return value
+            out.add(odd)
+
+    def _largest_of_parts(
+        self, pairs: Mapping[int, PairMatches], estimate: ComparedEstimate, out: Collection[int]
+    ) -> tuple[float, list[int]]:
+        """The largest statistic of a part of the frames, and the part's scans; 0 and none without any."""
+        scores = [(scan, self.matcher.linearized({scan: pairs[scan]}, estimate.point, out)) for scan in pairs]
+        # A scan whose matches are all left out has no score.
+        scored = [scan for scan, own in scores if own]
+        n = len(scored)
         cuts = range(2, n - 1)
         parts = {
             *((0, k) for k in cuts),
             *((k, n) for k in cuts),
             *((k, k + FRAMES) for k in range(n - FRAMES + 1)),
         }
-        # A scan whose matches are all left out has no score.
-        place = np.cumsum([0, *map(len, scores)]).tolist()
-        return self.statistic.largest_of_parts(
-            [score for own in scores for score in own],
-            {(place[a], place[b]) for a, b in parts},
-            estimate,
+        value, (first, end) = self.statistic.largest_of_parts(
+            [score for _, own in scores for score in own], sorted(parts), estimate
         )
+        return value, scored[first:end]
+
+    def _odd_one_out(
+        self,
+        pairs: Mapping[int, PairMatches],
+        estimate: ComparedEstimate,
+        out: Collection[int],
+        threshold: float,
+    ) -> int | None:
+        """The object without which frames agree with an estimate though they show as much; None without one.
+
+        They must show a turn of the camera without it, and a jump of the clock where they do with it.
+        """
+        tried = steps(estimate.point.cTl, DETECTABLE_TURN_RAD, DETECTABLE_OFFSET_S)
+
+        def compared(*without: int) -> Comparison | None:
+            scores = self.matcher.linearized(pairs, estimate.point, {*without, *out})
+            return self.statistic.compare(scores, estimate) if scores else None
+
+        whole = compared()
+        shown = np.zeros(3, bool) if whole is None else self.statistic.detectable(whole, tried)
+        for track in sorted(self.matcher.objects_of(pairs).difference(out)):
+            others = compared(track)
+            if others is None or self.statistic.normalized(others) > threshold:
+                continue
+            by_others = self.statistic.detectable(others, tried)
+            if by_others[:2].all() and by_others[2] >= shown[2]:
+                return track
+        return None
 
     # ------------------------------------------------------------------ new frames
 

@@ -213,10 +213,13 @@ class ChangeStatistic:
         scores: Sequence[LinearizedPair],
         parts: Collection[tuple[int, int]],
         estimate: ComparedEstimate,
-    ) -> float:
-        """Largest :meth:`normalized` statistic of parts (start, end) of the scores; 0 without any."""
+    ) -> tuple[float, tuple[int, int]]:
+        """Largest :meth:`normalized` statistic of parts (start, end) of the scores, and which part has it; 0
+        and (0, 0) without any."""
         compared = ComparedScores.of(scores, estimate, self.object_sigma_px)
-        return max((self.normalized(compared.part(a, b)) for a, b in parts if b > a), default=0.0)
+        values = {(a, b): self.normalized(compared.part(a, b)) for a, b in parts if b > a}
+        largest = max(values, key=values.__getitem__, default=(0, 0))
+        return values.get(largest, 0.0), largest
 
     def normalized(self, comparison: Comparison) -> float:
         """T over its usual size."""
