@@ -80,6 +80,9 @@ def tracker_result(tracker: Tracker, drive: str, camera_name: str) -> Calibratio
 def _unconfirmed(last: TrackUpdate, changes: ChangeDetector) -> tuple[str, ...]:
     if changes.start_unconfirmed:
         return ("no frames that came after the start have been found to agree with those it was made of",)
+    if changes.contradicted:
+        why = last.suspected_change or "a changed calibration, or wrong labels; further frames show which"
+        return (f"the latest frames contradict the estimate: {why}",)
     if not changes.confirmation.too_old:
         return ()
     of_offset = (
@@ -89,6 +92,5 @@ def _unconfirmed(last: TrackUpdate, changes: ChangeDetector) -> tuple[str, ...]:
     )
     return (
         "no frame would have shown a change of where the camera looks for the last "
-        f"{last.unconfirmed_s:.1f} s{of_offset}"
-        + (f"; {last.suspected_change}" if last.suspected_change else ""),
+        f"{last.unconfirmed_s:.1f} s{of_offset}",
     )

@@ -35,8 +35,8 @@ class TrackUpdate(ByValue):
         covariance: (7, 7) cluster-robust; None while there is no estimate, and ``covariance_reason`` says so.
         status: ``starting`` until a first estimate exists; ``alarm`` from an alarm until there is an estimate
             again; ``contradicted`` where the data contradict what is assumed; ``unconfirmed`` where no frames
-            have lately confirmed it, or ``undecided_sweep`` says why; else whether the limits of
-            observability are met.
+            have lately confirmed it, the latest contradict it, or ``undecided_sweep`` says why; else whether
+            the limits of observability are met.
         accepted: all of the frame was used; else ``reason`` says why not.
         reason: why the frame was not accepted; empty where it was.
         refused: the sensors of it whose data were not used: they have changed nothing.
@@ -146,7 +146,7 @@ def make_update(
         limits = tracker.setup.config.calibration.observability
         weak = open_directions(covariance, estimate.uncertainty.by_static_objects, point.cTl, limits)
         sweep = estimate.by_sweep().sentence
-        unconfirmed = changes.start_unconfirmed or confirmation.too_old or sweep
+        unconfirmed = changes.start_unconfirmed or changes.contradicted or confirmation.too_old or sweep
         status = "unobservable" if weak else "unconfirmed" if unconfirmed else "ok"
         contradictions = (*contradictions, *estimate.reasons)
         status = "contradicted" if contradictions else status

@@ -237,6 +237,22 @@ def _sure_tracker(street: SimulatedDrive) -> Tracker:
     return tracker_from_truth(street, dataclasses.replace(EARLY_START, calibration=calibration))
 
 
+def test_no_estimate_is_ok_while_the_latest_frames_contradict_it(
+    street: SimulatedDrive, frames: list[Frame]
+) -> None:
+    """From the first such frame on, not only from the alarm or from a suspected change."""
+    tracker, before = _warmed_up(_sure_tracker(street)), []
+    for frame in frames[: STEP + 8]:
+        assert frame.image is not None
+        image = knocked(frame.image, street, 0.5) if frame.index >= STEP else frame.image
+        update = tracker.add(dataclasses.replace(frame, image=image))
+        if update.chi2 is not None and update.chi2 > tracker.setup.config.alarm.chi2 and not update.alarm:
+            assert update.status == "unconfirmed" and not update.adopted
+            before.append(frame.index)
+            assert "contradict the estimate" in tracker.result().reasons[0]
+    assert before and before[0] >= STEP
+
+
 def test_a_knock_that_no_frame_can_show_is_not_ok(
     street: SimulatedDrive, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:

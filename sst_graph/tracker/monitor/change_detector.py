@@ -317,6 +317,11 @@ class ChangeDetector:
         return Restart(near, scans, "the calibration has changed", True, chi2)
 
     @property
+    def contradicted(self) -> bool:
+        """Whether the latest frames contradict the estimate: until it is known why, it is not confirmed."""
+        return self.statistic.exceeded > 0 or bool(self.suspected_change)
+
+    @property
     def lost(self) -> bool:
         """Whether two objects or more in view do not meet the image's labels at all."""
         objects = frozenset[int]().union(*(tracks for unmet, tracks in self._unmatched if unmet))
