@@ -208,7 +208,9 @@ class OnlineEstimate:
     def for_comparison(self) -> ComparedEstimate:
         """The running estimate, for the comparison of new frames with it."""
         assert self.smoother is not None
-        ratio = 1.0 if self.edges is None else variance_ratio(self.edges.found, self.covariance)
+        ratio = 1.0
+        if self.edges is not None:
+            ratio = variance_ratio(self.edges.spread(self.smoother), self.covariance)
         return self.uncertainty.compared(self.smoother, ratio)
 
     def history(self) -> list[HistoryEntry]:

@@ -203,8 +203,19 @@ def test_errors_of_edges_as_columns() -> None:
 
 
 def test_softness() -> None:
-    assert variance_ratio(EdgeReview(), np.eye(9)) == 1.0
-    assert variance_ratio(EdgeReview(spread=3.0 * np.eye(7)), np.eye(9)) == pytest.approx(4.0)
+    assert variance_ratio(np.zeros((7, 7)), np.eye(9)) == 1.0
+    assert variance_ratio(3.0 * np.eye(7), np.eye(9)) == pytest.approx(4.0)
+
+
+def test_the_softness_is_that_of_all_that_was_seen() -> None:
+    """A review's spread is of an estimate from the window alone; the running one has seen more."""
+    tracker = begun("edges", 0)
+    estimate, smoother = tracker.estimate, tracker.estimate.smoother
+    assert estimate.edges is not None and smoother is not None
+    estimate.edges.found = EdgeReview(spread=3.0 * estimate.covariance[:7, :7])
+    assert estimate.for_comparison().variance_ratio == pytest.approx(4.0)
+    smoother.sums.weight = 2.0 * sum(entry.linear.weight for entry in smoother.entries.values())
+    assert estimate.for_comparison().variance_ratio == pytest.approx(2.0)
 
 
 def test_a_doubt_is_a_status() -> None:

@@ -79,7 +79,7 @@ class Initialization:
 
     def for_comparison(self) -> ComparedEstimate:
         """For the comparison of frames with it."""
-        ratio = variance_ratio(self.first.review, self.uncertainty.covariance)
+        ratio = variance_ratio(self.first.review.spread, self.uncertainty.covariance)
         return self.uncertainty.compared(self.smoother, ratio)
 
 
