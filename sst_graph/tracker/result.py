@@ -18,6 +18,12 @@ if TYPE_CHECKING:
     from sst_graph.tracker.monitor.change_detector import ChangeDetector
     from sst_graph.tracker.tracker import Tracker
 
+_NO_ESTIMATE = {
+    "starting": "there is no estimate yet: record more frames with objects in view",
+    "alarm": "the calibration has changed, and there is no estimate of the new one yet: record more frames",
+}
+"""By the status: why the result is but the guess."""
+
 
 def tracker_result(tracker: Tracker, drive: str, camera_name: str) -> CalibrationResult:
     """The present estimate as a result; frames used are those of the window.
@@ -36,9 +42,7 @@ def tracker_result(tracker: Tracker, drive: str, camera_name: str) -> Calibratio
     elif last.status == "unconfirmed":
         reasons = _unconfirmed(last, tracker.monitor.changes)
     elif last.status != "ok":
-        reasons = (f"the tracker is {last.status}: no estimate of the calibration as it is now",)
-        if estimate.edges is not None and tracker.initializer.why:
-            reasons = (*reasons, tracker.initializer.why)
+        reasons = tuple(filter(None, (_NO_ESTIMATE[last.status], tracker.initializer.why)))
     if last.undecided_sweep:
         reasons = (*reasons, last.undecided_sweep)
     entries = {} if estimate.smoother is None else estimate.smoother.entries

@@ -352,8 +352,12 @@ def test_pictures_of_another_street_are_not_trusted() -> None:
     assert tracker.optimize().status != "ok"
 
 
-def test_a_result_says_why_there_is_no_start() -> None:
+@pytest.mark.parametrize("method", ["edges", "joint"])
+def test_a_result_says_why_there_is_no_start(method: str) -> None:
     street = simulated(TRACKED_STREET)
-    tracker = Tracker(street.camera, config("edges"), street.truth.cTl)
+    tracker = Tracker(street.camera, config(method), street.truth.cTl)
     tracker.initializer.failed("no LiDAR edge in any picture")
-    assert tracker.result().reasons[-1] == "no LiDAR edge in any picture"
+    no_estimate, why = tracker.result().reasons
+    assert "no estimate yet" in no_estimate and why == "no LiDAR edge in any picture"
+    tracker.initializer.restart(tracker.initializer.guess, 0, alarmed=True)
+    assert "the calibration has changed" in tracker.result().reasons[0]

@@ -294,5 +294,5 @@ class Initializer:
 
     def succeeded(self) -> None:
         """There is an estimate."""
-        self.alarmed, self.attempts, self.waited = False, 0, 0
+        self.alarmed, self.attempts, self.waited, self.why = False, 0, 0, ""
         self.search = self.graph = None
