@@ -211,7 +211,8 @@ class OnlineEstimate:
         ratio = 1.0
         if self.edges is not None:
             ratio = variance_ratio(self.edges.spread(self.smoother), self.covariance)
-        return self.uncertainty.compared(self.smoother, ratio)
+        compared = self.uncertainty.compared(self.smoother, ratio)
+        return dataclasses.replace(compared, reported=self.reported_covariance())
 
     def history(self) -> list[HistoryEntry]:
         """The calibration of every epoch, smoothed over all of them, with covariances (drift mode)."""

@@ -20,6 +20,7 @@ from sst_graph.tracker.monitor.confirmation import (
     DETECTABLE_OFFSET_S,
     DETECTABLE_TURN_RAD,
     Confirmation,
+    detectable_steps,
     steps,
 )
 from sst_graph.tracker.monitor.statistic import (
@@ -32,6 +33,7 @@ from sst_graph.tracker.monitor.statistic import (
 )
 from sst_graph.tracker.start.first_estimate import StartGuess
 from sst_graph.tracker.start.initializer import Restart
+from sst_graph.tracker.sums.linearized_pair import LinearizedPair
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.tracker.window.matcher import WindowMatcher
 
@@ -89,6 +91,7 @@ class ChangeDetector:
     step before it is detected.
 
     Attributes:
+        kernel: under which frames are compared.
         statistic: of the latest frames.
         scans: the latest frames that were compared.
         reference: the estimate from before a suspected change, while there is one.
@@ -102,7 +105,7 @@ class ChangeDetector:
     """
 
     def __init__(self, matcher: WindowMatcher, config: TrackerConfig) -> None:
-        self.matcher, self.config = matcher, config.alarm
+        self.matcher, self.config, self.kernel = matcher, config.alarm, _KERNEL
         sigma_px = config.calibration.noise.object_bias_sigma_px
         self.statistic = ChangeStatistic(config.alarm.chi2, sigma_px)
         self.start_threshold, self.warm_up_scans = _START_CHI2, _WARM_UP_SCANS
@@ -115,6 +118,7 @@ class ChangeDetector:
         self._first_recheck = config.start_scans // 2
         self._start_scan, self._recheck_after = 0, self._first_recheck
         self._before: deque[Reference] = deque(maxlen=FRAMES)
+        self._latest: deque[tuple[Reference, LinearizedPair]] = deque(maxlen=_MAX_PENDING_FRAMES)
         self._unmatched: deque[tuple[bool, frozenset[int]]] = deque(maxlen=_LOST_FRAMES)
         self._moving: set[int] = set()
 
@@ -123,6 +127,7 @@ class ChangeDetector:
         self.statistic.restart()
         self.scans.clear()
         self._before.clear()
+        self._latest.clear()
         self._unmatched.clear()
         self.reference, self.suspected_change = None, ""
 
@@ -279,6 +284,7 @@ class ChangeDetector:
         against = self.reference or self._before[-1]
         scores = self.matcher.linearized_at(against.point, list(views), _KERNEL, self._moving)
         value = self.statistic.add(scores, against.compared(estimate))
+        self._latest.extend((self._before[-1], score) for score in scores)
         # 3. Keep the reference, or discard it.
         if self.statistic.exceeded > self.max_pending:
             self.confirmation.unreliable |= self.matcher.objects_of(self.scans) - self._moving
@@ -363,8 +369,27 @@ class ChangeDetector:
                 if self.statistic.normalized(comparison) > self.config.chi2:
                     return
         if comparison is not None:
-            tried = steps(estimate.point.cTl, DETECTABLE_TURN_RAD, DETECTABLE_OFFSET_S)
-            self.confirmation.add(self.statistic.detectable(comparison, tried))
+            reported = estimate.covariance.matrix[:7, :7] if estimate.reported is None else estimate.reported
+            tried = detectable_steps(estimate.point.cTl, reported)
+            shown = self.statistic.detectable(comparison, tried)
+            if not (shown.all() or unreliable):
+                # They may do so together with those before them.
+                more = self._with_earlier_frames(estimate)
+                if self.statistic.normalized(more) <= self.config.chi2:
+                    shown |= self.statistic.detectable(more, tried)
+            self.confirmation.add(shown)
+
+    def _with_earlier_frames(self, estimate: ComparedEstimate) -> Comparison:
+        """The latest scans that have been compared, as many as a change may be pending for, against the
+        estimate from before the first of them."""
+        first = self.matcher.window.next_scan - _MAX_PENDING_FRAMES
+        latest = [(before, score) for before, score in self._latest if before.scan >= first]
+        before, _ = latest[0]
+        scores = [
+            replace(score, information=score.information.at(before.point.seen(score.places)))
+            for _, score in latest
+        ]
+        return self.statistic.compare(scores, before.compared(estimate))
 
     def _contradicted(self, reference: Reference, estimate: ComparedEstimate) -> bool:
         """Whether all frames since the reference contradict it.
