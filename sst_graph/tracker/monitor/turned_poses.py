@@ -23,6 +23,8 @@ _FRAMES = 8
 """Held-out frames in a row that must meet the pictures better at a turned pose."""
 _LEAST_USUAL_FRAMES, _USUAL_FRAMES = 10, 300
 """Least and most frames that say how much worse a turned pose usually is."""
+_FEW = 0.2
+"""Part of the frames in which the estimate may be the worse one: in more, costs show nothing."""
 _SHARE = 0.5
 """A turned pose must be better by this part of what it usually is worse by."""
 _TURNS_RAD = np.radians([0.5, 1.0])
@@ -40,7 +42,7 @@ class TurnedPoses:
 
     Attributes:
         gains: (k,) of the latest frames: cost at the estimate less that at each turned pose.
-        usual: by how much the turned poses were worse, in frames that contradicted nothing.
+        usual: by how much the turned poses were worse on average, frame by frame.
     """
 
     def __init__(self) -> None:
@@ -65,15 +67,17 @@ class TurnedPoses:
             return
         gains = own - np.array(known)
         self.gains.append(gains)
-        if (gains < 0.0).all():
-            self.usual.append(float(-gains.mean()))
+        self.usual.append(float(-gains.mean()))
 
     def better(self, point: Point) -> Point | None:
         """The turned pose that the latest frames agree with instead of the estimate; None where none is."""
         if len(self.gains) < _FRAMES or len(self.usual) < _LEAST_USUAL_FRAMES:
             return None
+        low, usual = np.quantile(self.usual, [_FEW, 0.5])
+        if low < 0.0:
+            return None
         gains = np.array(self.gains)
         means = np.where((gains > 0.0).all(axis=0), gains.mean(axis=0), 0.0)
-        if means.max() < _SHARE * float(np.median(self.usual)):
+        if means.max() < _SHARE * usual:
             return None
         return turned(point, _AXES[int(means.argmax())])
