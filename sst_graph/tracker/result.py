@@ -15,7 +15,7 @@ from sst_graph.result import CalibrationResult, FrameId, Status
 from sst_graph.tracker.track_update import TrackUpdate, current_update
 
 if TYPE_CHECKING:
-    from sst_graph.tracker.monitor.change_detector import ChangeDetector
+    from sst_graph.tracker.monitor.monitor import Monitor
     from sst_graph.tracker.tracker import Tracker
 
 _NO_ESTIMATE = {
@@ -40,7 +40,7 @@ def tracker_result(tracker: Tracker, drive: str, camera_name: str) -> Calibratio
     elif last.status == "contradicted":
         reasons = (*last.contradictions, *reasons)
     elif last.status == "unconfirmed":
-        reasons = _unconfirmed(last, tracker.monitor.changes)
+        reasons = _unconfirmed(last, tracker.monitor)
     elif last.status != "ok":
         reasons = tuple(filter(None, (_NO_ESTIMATE[last.status], tracker.initializer.why)))
     if last.undecided_sweep:
@@ -81,10 +81,11 @@ def tracker_result(tracker: Tracker, drive: str, camera_name: str) -> Calibratio
     )
 
 
-def _unconfirmed(last: TrackUpdate, changes: ChangeDetector) -> tuple[str, ...]:
+def _unconfirmed(last: TrackUpdate, monitor: Monitor) -> tuple[str, ...]:
+    changes = monitor.changes
     if changes.start_unconfirmed:
         return ("no frames that came after the start have been found to agree with those it was made of",)
-    if changes.contradicted:
+    if monitor.contradicted:
         why = last.suspected_change or "a changed calibration, or wrong labels; further frames show which"
         return (f"the latest frames contradict the estimate: {why}",)
     if not changes.confirmation.too_old:

@@ -146,7 +146,8 @@ def make_update(
         limits = tracker.setup.config.calibration.observability
         weak = open_directions(covariance, estimate.uncertainty.by_static_objects, point.cTl, limits)
         sweep = estimate.by_sweep().sentence
-        unconfirmed = changes.start_unconfirmed or changes.contradicted or confirmation.too_old or sweep
+        contradicted = tracker.monitor.contradicted
+        unconfirmed = changes.start_unconfirmed or contradicted or confirmation.too_old or sweep
         status = "unobservable" if weak else "unconfirmed" if unconfirmed else "ok"
         contradictions = (*contradictions, *estimate.reasons)
         status = "contradicted" if contradictions else status

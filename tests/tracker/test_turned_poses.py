@@ -31,13 +31,14 @@ def test_a_turn_is_found_where_it_leads(axis: int, degrees: float) -> None:
     noise, poses = np.random.default_rng(3), TurnedPoses()
     for _ in range(30):
         poses.add(cost_around(POINT, noise), POINT)
-        assert poses.better(POINT) is None
+        assert poses.better(POINT) is None and not poses.contradicted
     new = turned(POINT, np.radians(degrees) * np.eye(3)[axis])
     found = []
     for _ in range(8):
         found.append(poses.better(POINT))
         poses.add(cost_around(new, noise), POINT)
     better = poses.better(POINT)
+    assert poses.contradicted
     assert found == [None] * 8 and better is not None and better.time_offset_s == POINT.time_offset_s
     left = gtsam.Rot3.Logmap(better.cTl.rotation().between(new.cTl.rotation()))
     assert np.degrees(np.linalg.norm(left)) < 0.3

@@ -324,7 +324,7 @@ class ChangeDetector:
 
     @property
     def contradicted(self) -> bool:
-        """Whether the latest frames contradict the estimate: until it is known why, it is not confirmed."""
+        """Whether the latest frames are past the threshold, or a change is suspected."""
         return self.statistic.exceeded > 0 or bool(self.suspected_change)
 
     @property

@@ -95,6 +95,11 @@ class Monitor:
         self.adoption.restart()
         self.turned.restart()
 
+    @property
+    def contradicted(self) -> bool:
+        """Whether the latest frames contradict the estimate: until it is known why, it is not confirmed."""
+        return self.changes.contradicted or self.turned.contradicted
+
     def restart(self) -> None:
         """The calibration is estimated again."""
         self.changes.restart()

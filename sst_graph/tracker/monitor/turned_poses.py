@@ -21,6 +21,8 @@ FloatArray = NDArray[np.float64]
 
 _FRAMES = 8
 """Held-out frames in a row that must meet the pictures better at a turned pose."""
+_SUSPECTED = 2
+"""The same for the estimate not to be confirmed."""
 _LEAST_USUAL_FRAMES, _USUAL_FRAMES = 10, 300
 """Least and most frames that say how much worse a turned pose usually is."""
 _FEW = 0.2
@@ -71,13 +73,19 @@ class TurnedPoses:
 
     def better(self, point: Point) -> Point | None:
         """The turned pose that the latest frames agree with instead of the estimate; None where none is."""
-        if len(self.gains) < _FRAMES or len(self.usual) < _LEAST_USUAL_FRAMES:
+        place = self._place(_FRAMES)
+        return None if place is None else turned(point, _AXES[place])
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether the last few frames agree with a turned pose, though that may be by chance."""
+        return self._place(_SUSPECTED) is not None
+
+    def _place(self, frames: int) -> int | None:
+        """Of the turned pose that so many frames in a row agree with."""
+        if len(self.gains) < frames or len(self.usual) < _LEAST_USUAL_FRAMES:
             return None
         low, usual = np.quantile(self.usual, [_FEW, 0.5])
-        if low < 0.0:
-            return None
-        gains = np.array(self.gains)
+        gains = np.array(self.gains)[-frames:]
         means = np.where((gains > 0.0).all(axis=0), gains.mean(axis=0), 0.0)
-        if means.max() < _SHARE * usual:
-            return None
-        return turned(point, _AXES[int(means.argmax())])
+        return None if low < 0.0 or means.max() < _SHARE * usual else int(means.argmax())

@@ -259,13 +259,18 @@ class Window:
             # As in a drive: the k-th motion leads from the k-th scan to the next.
             motions = tuple(motion for motion in motions if motion.from_ns >= scans[0].stamp_ns)
         images = tuple(self.images)
+        # Images are forgotten on their own.
+        stamps = {image.stamp_ns for image in images}
+        pairs = (
+            pair for pair in self.image_pairs if stamps.issuperset((pair.tracks.from_ns, pair.tracks.to_ns))
+        )
         drive = Drive(
             "window",
             self.camera,
             tuple(scans),
             images,
             motions,
-            tuple(self.image_pairs),
+            tuple(pairs),
             origin_ns=self.origin_ns,
             labelled_ns=(frozenset(self.labelled_ns[0]), frozenset(self.labelled_ns[1])),
         )
