@@ -301,6 +301,23 @@ def test_frames_that_show_nothing_let_the_estimate_age(
     assert status[-1] == "ok" and update.unconfirmed_s == 0.0
 
 
+@pytest.mark.parametrize("missing", ["empty", "none"])
+def test_without_scans_the_estimate_ages(street: SimulatedDrive, frames: list[Frame], missing: str) -> None:
+    """The LiDAR delivers empty scans for a while, or none: nothing changes, but time passes."""
+    tracker, status = _sure_tracker(street), []
+    for frame in frames[: STEP + 16]:
+        assert frame.scan is not None
+        dead = STEP <= frame.index < STEP + 12
+        none = {name: value[:0] for name, value in vars(frame.scan).items() if isinstance(value, np.ndarray)}
+        scan = dataclasses.replace(frame.scan, **none) if missing == "empty" else None
+        update = tracker.add(dataclasses.replace(frame, scan=scan) if dead else frame)
+        status.append(update.status)
+        if frame.index == STEP + 11:
+            assert 1.1 < update.unconfirmed_s < 1.4
+    assert status[STEP - 1] == status[STEP] == "ok"
+    assert status[STEP + 11] == "unconfirmed"
+
+
 def test_a_suspected_change_that_is_given_up_is_no_confirmation(
     street: SimulatedDrive, frames: list[Frame]
 ) -> None:

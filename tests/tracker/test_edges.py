@@ -32,7 +32,7 @@ from sst_graph.tracker.estimate import OnlineEstimate
 from sst_graph.tracker.start.first_estimate import FirstEstimate
 from sst_graph.tracker.start.initializer import InitialGraph
 from sst_graph.tracker.sums.held import EDGE_ERRORS, SHIFTS, edge_error_columns, held_names
-from sst_graph.tracker.track_update import TrackUpdate, current_update
+from sst_graph.tracker.track_update import TrackUpdate
 from sst_graph.types import CameraImage, Frame, Scan, SemanticClass, Source
 from studies.edges_streets import source_of, start_step
 
@@ -240,7 +240,7 @@ def test_new_frames_are_compared_with_turned_poses() -> None:
     # Frames that are past the threshold of these are no confirmation.
     turned.usual.extend([0.1] * 10)
     turned.gains.extend([np.eye(8)[3]] * 2)
-    assert current_update(tracker).status == "unconfirmed"
+    assert turned.contradicted and tracker.monitor.contradicted
     turned.gains.extend([np.eye(8)[3]] * 6)
     restart = tracker.monitor._turned(tracker.estimate.point, None)
     assert restart is not None and restart.alarm and restart.scans == 8

@@ -43,7 +43,11 @@ class Confirmation:
     @property
     def too_old(self) -> bool:
         """Whether the estimate is unconfirmed."""
-        return self.turn_s > _MAX_TURN_AGE_S or self.time_offset_s > _MAX_OFFSET_AGE_S
+        return self.too_old_after(0.0)
+
+    def too_old_after(self, seconds: float) -> bool:
+        """Whether it is once so much more time has passed."""
+        return self.turn_s + seconds > _MAX_TURN_AGE_S or self.time_offset_s > _MAX_OFFSET_AGE_S
 
     def begin(self) -> None:
         """A start confirms everything."""
