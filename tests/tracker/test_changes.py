@@ -25,6 +25,7 @@ from sst_graph.covariance.observability import ObservabilityConfig
 from sst_graph.simulator import SimulatedDrive
 from sst_graph.tracker.config import AlarmConfig, DriftConfig, TrackerConfig
 from sst_graph.tracker.history import HistoryEntry
+from sst_graph.tracker.monitor.confirmation import DETECTABLE_OFFSET_S, DETECTABLE_TURN_RAD, steps
 from sst_graph.tracker.track_update import TrackUpdate, current_update
 from sst_graph.types import Frame, SemanticClass
 
@@ -299,6 +300,19 @@ def test_frames_that_show_nothing_let_the_estimate_age(
     assert "unconfirmed" not in status[CHECKED : STEP + 8]
     assert status[STEP + 11] == "unconfirmed"
     assert status[-1] == "ok" and update.unconfirmed_s == 0.0
+
+
+def test_frames_confirm_together_what_four_do_not_show(street: SimulatedDrive, frames: list[Frame]) -> None:
+    """A threshold that a turn by 0.25 degrees passes in the latest 20 scans, but not in four."""
+    config = dataclasses.replace(EARLY_START, alarm=AlarmConfig(chi2=130.0))
+    tracker = tracker_from_truth(street, config)
+    for frame in frames[:30]:
+        update = tracker.add(frame)
+    changes, point = tracker.monitor.changes, tracker.estimate.point
+    tried = steps(point.cTl, DETECTABLE_TURN_RAD, DETECTABLE_OFFSET_S)
+    assert changes.statistic.latest is not None
+    assert not changes.statistic.detectable(changes.statistic.latest, tried)[1]
+    assert update.unconfirmed_s == 0.0
 
 
 @pytest.mark.parametrize("missing", ["empty", "none"])
