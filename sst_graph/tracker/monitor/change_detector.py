@@ -324,8 +324,8 @@ class ChangeDetector:
 
     @property
     def contradicted(self) -> bool:
-        """Whether the latest frames are past the threshold, or a change is suspected."""
-        return self.statistic.exceeded > 0 or bool(self.suspected_change)
+        """Whether two frames or more in a row are past the threshold, or a change is suspected."""
+        return self.statistic.exceeded > 1 or bool(self.suspected_change)
 
     @property
     def lost(self) -> bool:
