@@ -83,8 +83,8 @@ def test_results_of_several_drives_are_fused(tmp_path: Path) -> None:
 def test_a_simulated_bag_goes_through_the_pages_on_bags(capsys: pytest.CaptureFixture[str]) -> None:
     page = (DOCS / "how-to/ros.md").read_text(encoding="utf-8")
     exec(compile(code_of("how-to/ros.md"), "ros.md", "exec"), {})
-    calibrate, export = re.findall(r"^sst-graph ((?:calibrate street|export) .*)$", page, re.MULTILINE)
-    assert main(["info", "street", "--mask-topic", "/camera/mask"]) == 0
+    calibrate, export = re.findall(r"^sst-graph ((?:calibrate recorded|export) .*)$", page, re.MULTILINE)
+    assert main(["info", "recorded", "--mask-topic", "/camera/mask"]) == 0
     frames = re.search(r"by transforms (\S+) - (\S+)", capsys.readouterr().out)
     assert frames is not None
     assert main(shlex.split(calibrate)) == 0

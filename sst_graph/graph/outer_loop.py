@@ -215,7 +215,7 @@ def solve_joint_steps(
         count = sum(map(len, matches))
         iterations.append(OuterIteration(scale, count, state.cTl, state.time_offsets_s[0]))
         if progress is not None:
-            progress("joint", outer + 1, config.max_outer)
+            progress("solve", outer + 1, config.max_outer)
         yield 1 + pairs // _PAIRS_A_UNIT
         # 4. Stop when the step is small at the last scale.
         if at_last >= 0:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.data.ros.messages import BagWriter, MessageMaker
-from sst_graph.errors import MissingDependencyError
+from sst_graph.errors import ConfigError, MissingDependencyError
 from sst_graph.simulator.drive import RawFrame, SimulatedDrive
 from sst_graph.simulator.surfaces import CITYSCAPES, SEMANTIC_KITTI
 
@@ -33,7 +33,7 @@ def write_bag(drive: SimulatedDrive, path: str | Path, labels: bool = True) -> P
 
     Raises:
         MissingDependencyError: ``rosbags`` is not installed.
-        rosbags.rosbag2.WriterError: ``path`` is there already.
+        ConfigError: ``path`` is there already.
     """
     try:
         from rosbags.rosbag2 import StoragePlugin, Writer
@@ -41,6 +41,8 @@ def write_bag(drive: SimulatedDrive, path: str | Path, labels: bool = True) -> P
         raise MissingDependencyError(
             "bags need rosbags, which is not installed: pip install 'sst-graph[ros]'"
         ) from None
+    if Path(path).exists():
+        raise ConfigError(f"{path}: found a file or folder, expected the name of a new one")
     make = MessageMaker()
     with Writer(Path(path), version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         bag = BagWriter(make, writer)

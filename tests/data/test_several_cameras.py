@@ -139,8 +139,10 @@ def test_cameras_that_a_bag_has_not(bag: Path) -> None:
         open_source(bag, camera="cam7", mask_topic="mask")
     with pytest.raises(DataError, match=r"several topics of .*/cam0/image_raw .*/cam0/mask .*--camera"):
         open_source(bag, camera="cam0", mask_topic="masks")
-    with pytest.raises(DataError, match="several topics"):
+    with pytest.raises(DataError, match=r"several topics .* expected one, named by --image-topic$"):
         open_source(bag, mask_topic="mask")
+    with pytest.raises(DataError, match=r"named by --image-topic; of masks by --mask-topic /cam\d/mask$"):
+        open_source(bag)
 
 
 def test_cameras_that_kitti_has_not(stereo: Path) -> None:

@@ -39,7 +39,17 @@ def _solved() -> tuple[CalibrationProblem, JointSolution]:
     assert truth is not None and truth.time_offset_s is not None
     problem = CalibrationProblem.of(_drives(), Guess(truth.cTl, truth.time_offset_s), CONFIG)
     start = State(truth.cTl, (truth.time_offset_s,))
-    return problem, solve_joint(problem.joint(), start, NARROW_KERNELS_PX)
+    return problem, solve_joint(problem.joint(), start, NARROW_KERNELS_PX, lambda *step: _stages.add(step[0]))
+
+
+_stages: set[str] = set()
+"""Names that the solution above has given its progress."""
+
+
+def test_progress_names_no_method() -> None:
+    """Edges and the parts of a test are solved by the same loop."""
+    _solved()
+    assert _stages == {"solve"}
 
 
 def _of_drives() -> FitOfDrives:

@@ -9,7 +9,7 @@ import pytest
 from stored import simulated
 
 from sst_graph import open_source
-from sst_graph.errors import SstGraphError
+from sst_graph.errors import ConfigError, SstGraphError
 from sst_graph.simulator import SimulationConfig, write_bag
 from sst_graph.simulator.bag import EPOCH_NS, MASK
 
@@ -30,6 +30,12 @@ def test_a_bag_holds_the_drive(tmp_path: Path) -> None:
             np.testing.assert_array_equal(getattr(scan, name), getattr(expected.scan, name), name)
         np.testing.assert_array_equal(image.pixels, expected.image.pixels)
         np.testing.assert_array_equal(image.mask, expected.image.mask)
+
+
+def test_a_folder_that_is_there_is_kept(tmp_path: Path) -> None:
+    (tmp_path / "street").mkdir()
+    with pytest.raises(ConfigError, match=r"street: found a file or folder, expected the name of a new one"):
+        write_bag(simulated(STREET), tmp_path / "street")
 
 
 def test_without_labels_there_is_no_mask_and_no_class(tmp_path: Path) -> None:

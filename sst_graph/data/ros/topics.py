@@ -16,6 +16,8 @@ CLOUD, INFO = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/CameraInfo"
 _TRANSFORMS = (TF_MESSAGE, "tf/msg/tfMessage")
 _LISTED = 12
 """Topics that an error lists at most."""
+_MASK_WORDS = ("mask", "label", "semantic", "segment")
+"""In the name of a topic of images: these may be masks of labels."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,9 @@ def _one(
     what = " or ".join(types)
     if not fitting:
         raise DataError(path, f"no topic of {what} among {listed(topics.values())}", "one")
-    raise DataError(path, f"several topics of {what}: {listed(fitting)}", f"one, named by {option}")
+    masks = [topic.name for topic in fitting if any(word in topic.name for word in _MASK_WORDS)]
+    hint = f"; of masks by --mask-topic {masks[0]}" if masks else ""
+    raise DataError(path, f"several topics of {what}: {listed(fitting)}", f"one, named by {option}{hint}")
 
 
 def _info(path: Path, topics: Mapping[str, Topic], name: str | None, image: Topic) -> Topic:
