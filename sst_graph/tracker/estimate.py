@@ -208,8 +208,11 @@ class OnlineEstimate:
     def for_comparison(self) -> ComparedEstimate:
         """The running estimate, for the comparison of new frames with it."""
         assert self.smoother is not None
-        ratio = 1.0 if self.edges is None else variance_ratio(self.edges.found, self.covariance)
-        return self.uncertainty.compared(self.smoother, ratio)
+        ratio = 1.0
+        if self.edges is not None:
+            ratio = variance_ratio(self.edges.spread(self.smoother), self.covariance)
+        compared = self.uncertainty.compared(self.smoother, ratio)
+        return dataclasses.replace(compared, reported=self.reported_covariance())
 
     def history(self) -> list[HistoryEntry]:
         """The calibration of every epoch, smoothed over all of them, with covariances (drift mode)."""

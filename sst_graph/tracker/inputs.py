@@ -20,7 +20,7 @@ from sst_graph.tracker.by_edges.kinds import by_edges
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.estimate import OnlineEstimate
 from sst_graph.tracker.storage.resume import FirstFrames
-from sst_graph.tracker.window.window import Window
+from sst_graph.tracker.window.window import FARTHEST_NS, Window
 from sst_graph.types import CameraImage, Scan
 from sst_graph.validation import checked_image, checked_scan
 
@@ -28,8 +28,6 @@ _Data = TypeVar("_Data", Scan, CameraImage)
 
 _CLOSEST_NS = 1_000_000
 """Scans that are nearer to each other are one; no LiDAR turns a thousand times a second [ns]."""
-_FARTHEST_NS = 86_400 * 10**9
-"""A stamp that is farther ahead of the one before is an error, not a pause: a day [ns]."""
 _ELSEWHERE = 5
 """Stamps in a row, rising but far from those before, that show that the clock was set."""
 _MAX_IMAGES = 600
@@ -90,7 +88,7 @@ class StampOrder:
 
     def _follows(self, stamp_ns: int, before_ns: int) -> bool:
         step = stamp_ns - before_ns
-        return step <= _FARTHEST_NS and (self.may_be_late or step >= _CLOSEST_NS)
+        return step <= FARTHEST_NS and (self.may_be_late or step >= _CLOSEST_NS)
 
 
 def _with_own_arrays(data: _Data) -> _Data:

@@ -15,8 +15,14 @@ from sst_graph.result import CalibrationResult, FrameId, Status
 from sst_graph.tracker.track_update import TrackUpdate, current_update
 
 if TYPE_CHECKING:
-    from sst_graph.tracker.monitor.change_detector import ChangeDetector
+    from sst_graph.tracker.monitor.monitor import Monitor
     from sst_graph.tracker.tracker import Tracker
+
+_NO_ESTIMATE = {
+    "starting": "there is no estimate yet: record more frames with objects in view",
+    "alarm": "the calibration has changed, and there is no estimate of the new one yet: record more frames",
+}
+"""By the status: why the result is but the guess."""
 
 
 def tracker_result(tracker: Tracker, drive: str, camera_name: str) -> CalibrationResult:
@@ -34,11 +40,9 @@ def tracker_result(tracker: Tracker, drive: str, camera_name: str) -> Calibratio
     elif last.status == "contradicted":
         reasons = (*last.contradictions, *reasons)
     elif last.status == "unconfirmed":
-        reasons = _unconfirmed(last, tracker.monitor.changes)
+        reasons = _unconfirmed(last, tracker.monitor)
     elif last.status != "ok":
-        reasons = (f"the tracker is {last.status}: no estimate of the calibration as it is now",)
-        if estimate.edges is not None and tracker.initializer.why:
-            reasons = (*reasons, tracker.initializer.why)
+        reasons = tuple(filter(None, (_NO_ESTIMATE[last.status], tracker.initializer.why)))
     if last.undecided_sweep:
         reasons = (*reasons, last.undecided_sweep)
     entries = {} if estimate.smoother is None else estimate.smoother.entries
@@ -77,9 +81,13 @@ def tracker_result(tracker: Tracker, drive: str, camera_name: str) -> Calibratio
     )
 
 
-def _unconfirmed(last: TrackUpdate, changes: ChangeDetector) -> tuple[str, ...]:
+def _unconfirmed(last: TrackUpdate, monitor: Monitor) -> tuple[str, ...]:
+    changes = monitor.changes
     if changes.start_unconfirmed:
         return ("no frames that came after the start have been found to agree with those it was made of",)
+    if monitor.contradicted:
+        why = last.suspected_change or "a changed calibration, or wrong labels; further frames show which"
+        return (f"the latest frames contradict the estimate: {why}",)
     if not changes.confirmation.too_old:
         return ()
     of_offset = (
@@ -89,6 +97,5 @@ def _unconfirmed(last: TrackUpdate, changes: ChangeDetector) -> tuple[str, ...]:
     )
     return (
         "no frame would have shown a change of where the camera looks for the last "
-        f"{last.unconfirmed_s:.1f} s{of_offset}"
-        + (f"; {last.suspected_change}" if last.suspected_change else ""),
+        f"{last.unconfirmed_s:.1f} s{of_offset}",
     )

@@ -35,8 +35,8 @@ class TrackUpdate(ByValue):
         covariance: (7, 7) cluster-robust; None while there is no estimate, and ``covariance_reason`` says so.
         status: ``starting`` until a first estimate exists; ``alarm`` from an alarm until there is an estimate
             again; ``contradicted`` where the data contradict what is assumed; ``unconfirmed`` where no frames
-            have lately confirmed it, or ``undecided_sweep`` says why; else whether the limits of
-            observability are met.
+            have lately confirmed it, the latest contradict it, or ``undecided_sweep`` says why; else whether
+            the limits of observability are met.
         accepted: all of the frame was used; else ``reason`` says why not.
         reason: why the frame was not accepted; empty where it was.
         refused: the sensors of it whose data were not used: they have changed nothing.
@@ -44,8 +44,8 @@ class TrackUpdate(ByValue):
         chi2: statistic of the change test, over its usual size; None where there are too few frames.
         suspected_change: why the statistic, past its threshold for some frames, raises no alarm; else empty.
         alarm: this frame raised the alarm: the calibration has changed.
-        unconfirmed_s: time since frames last agreed with the estimate that would have shown a turn of the
-            camera; above 1 s the status is ``unconfirmed`` [s].
+        unconfirmed_s: time, up to this stamp, since frames last agreed with the estimate that would have
+            shown a turn of the camera; above 1 s the status is ``unconfirmed`` [s].
         time_offset_unconfirmed_s: time at more than 3 m/s since frames last agreed with it that would have
             shown a jump of the clock; above 3 s the status is ``unconfirmed`` [s].
         adopted: the estimate is the calibration in use from now on.
@@ -139,6 +139,8 @@ def make_update(
     estimate, changes = tracker.estimate, tracker.monitor.changes
     point, covariance = estimate.point, estimate.reported_covariance()
     confirmation, contradictions = changes.confirmation, contradiction_sentence(estimate.findings)
+    # Where no scan can be used, nothing confirms the estimate either.
+    since_scan_s = tracker.inputs.window.seconds_since_scan(stamp_ns) if estimate.exists else 0.0
     status: TrackStatus = "alarm" if tracker.initializer.alarmed else "starting"
     weak: tuple[WeakDirection, ...] = ()
     sweep = ""
@@ -146,7 +148,9 @@ def make_update(
         limits = tracker.setup.config.calibration.observability
         weak = open_directions(covariance, estimate.uncertainty.by_static_objects, point.cTl, limits)
         sweep = estimate.by_sweep().sentence
-        unconfirmed = changes.start_unconfirmed or confirmation.too_old or sweep
+        contradicted = tracker.monitor.contradicted
+        too_old = confirmation.too_old_after(since_scan_s)
+        unconfirmed = changes.start_unconfirmed or contradicted or too_old or sweep
         status = "unobservable" if weak else "unconfirmed" if unconfirmed else "ok"
         contradictions = (*contradictions, *estimate.reasons)
         status = "contradicted" if contradictions else status
@@ -163,7 +167,7 @@ def make_update(
         chi2=chi2,
         suspected_change=changes.suspected_change,
         alarm=alarm,
-        unconfirmed_s=confirmation.turn_s,
+        unconfirmed_s=confirmation.turn_s + since_scan_s,
         time_offset_unconfirmed_s=confirmation.time_offset_s,
         weak_directions=weak,
         contradictions=contradictions,

@@ -329,8 +329,8 @@ class Tracker:
         self.monitor.changes.recheck_start(matches.scan, self.estimate.for_comparison())
         reason = "" if matches.new else "no match: no scan met an image that shows the same objects"
         update = make_update(self, stamp_ns, reason, chi2=chi2)
-        trusted = update.status == "ok" and not update.suspected_change
-        adopted = bool(matches.new) and self.monitor.adoption.propose(self.estimate.point, trusted)
+        trusted = bool(matches.new) and update.status == "ok"
+        adopted = self.monitor.adoption.propose(self.estimate.point, trusted)
         return dataclasses.replace(update, adopted=adopted)
 
     def _not_added(self, sensor: Sensor, data: object, error: Exception) -> TrackUpdate:

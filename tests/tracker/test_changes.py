@@ -25,6 +25,7 @@ from sst_graph.covariance.observability import ObservabilityConfig
 from sst_graph.simulator import SimulatedDrive
 from sst_graph.tracker.config import AlarmConfig, DriftConfig, TrackerConfig
 from sst_graph.tracker.history import HistoryEntry
+from sst_graph.tracker.monitor.confirmation import DETECTABLE_OFFSET_S, DETECTABLE_TURN_RAD, steps
 from sst_graph.tracker.track_update import TrackUpdate, current_update
 from sst_graph.types import Frame, SemanticClass
 
@@ -237,6 +238,23 @@ def _sure_tracker(street: SimulatedDrive) -> Tracker:
     return tracker_from_truth(street, dataclasses.replace(EARLY_START, calibration=calibration))
 
 
+def test_no_estimate_is_ok_while_the_latest_frames_contradict_it(
+    street: SimulatedDrive, frames: list[Frame]
+) -> None:
+    """From the second such frame on, not only from the alarm or from a suspected change."""
+    tracker, before, past = _warmed_up(_sure_tracker(street)), list[int](), 0
+    for frame in frames[: STEP + 8]:
+        assert frame.image is not None
+        image = knocked(frame.image, street, 0.5) if frame.index >= STEP else frame.image
+        update = tracker.add(dataclasses.replace(frame, image=image))
+        past = past + 1 if (update.chi2 or 0.0) > tracker.setup.config.alarm.chi2 else 0
+        if past > 1 and not update.alarm:
+            assert update.status == "unconfirmed" and not update.adopted
+            before.append(frame.index)
+            assert "contradict the estimate" in tracker.result().reasons[0]
+    assert before and before[0] >= STEP
+
+
 def test_a_knock_that_no_frame_can_show_is_not_ok(
     street: SimulatedDrive, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -283,6 +301,36 @@ def test_frames_that_show_nothing_let_the_estimate_age(
     assert "unconfirmed" not in status[CHECKED : STEP + 8]
     assert status[STEP + 11] == "unconfirmed"
     assert status[-1] == "ok" and update.unconfirmed_s == 0.0
+
+
+def test_frames_confirm_together_what_four_do_not_show(street: SimulatedDrive, frames: list[Frame]) -> None:
+    """A threshold that a turn by 0.25 degrees passes in the latest 20 scans, but not in four."""
+    config = dataclasses.replace(EARLY_START, alarm=AlarmConfig(chi2=130.0))
+    tracker = tracker_from_truth(street, config)
+    for frame in frames[:30]:
+        update = tracker.add(frame)
+    changes, point = tracker.monitor.changes, tracker.estimate.point
+    tried = steps(point.cTl, DETECTABLE_TURN_RAD, DETECTABLE_OFFSET_S)
+    assert changes.statistic.latest is not None
+    assert not changes.statistic.detectable(changes.statistic.latest, tried)[1]
+    assert update.unconfirmed_s == 0.0
+
+
+@pytest.mark.parametrize("missing", ["empty", "none"])
+def test_without_scans_the_estimate_ages(street: SimulatedDrive, frames: list[Frame], missing: str) -> None:
+    """The LiDAR delivers empty scans for a while, or none: nothing changes, but time passes."""
+    tracker, status = _sure_tracker(street), []
+    for frame in frames[: STEP + 16]:
+        assert frame.scan is not None
+        dead = STEP <= frame.index < STEP + 12
+        none = {name: value[:0] for name, value in vars(frame.scan).items() if isinstance(value, np.ndarray)}
+        scan = dataclasses.replace(frame.scan, **none) if missing == "empty" else None
+        update = tracker.add(dataclasses.replace(frame, scan=scan) if dead else frame)
+        status.append(update.status)
+        if frame.index == STEP + 11:
+            assert 1.1 < update.unconfirmed_s < 1.4
+    assert status[STEP - 1] == status[STEP] == "ok"
+    assert status[STEP + 11] == "unconfirmed"
 
 
 def test_a_suspected_change_that_is_given_up_is_no_confirmation(

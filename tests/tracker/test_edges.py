@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import gtsam
@@ -22,6 +23,7 @@ from sst_graph.cli import main
 from sst_graph.factors.alignment import weighted_residuals
 from sst_graph.features.picture_gradients import PictureGradients
 from sst_graph.graph.state import State
+from sst_graph.hand_eye.graph import camera_steps
 from sst_graph.metrics import calibration_errors
 from sst_graph.result import CalibrationResult, read_result
 from sst_graph.tracker import inputs
@@ -203,8 +205,45 @@ def test_errors_of_edges_as_columns() -> None:
 
 
 def test_softness() -> None:
-    assert variance_ratio(EdgeReview(), np.eye(9)) == 1.0
-    assert variance_ratio(EdgeReview(spread=3.0 * np.eye(7)), np.eye(9)) == pytest.approx(4.0)
+    assert variance_ratio(np.zeros((7, 7)), np.eye(9)) == 1.0
+    assert variance_ratio(3.0 * np.eye(7), np.eye(9)) == pytest.approx(4.0)
+
+
+def test_the_softness_is_that_of_all_that_was_seen() -> None:
+    """A review's spread is of an estimate from the window alone; the running one has seen more."""
+    tracker = begun("edges", 0)
+    estimate, smoother = tracker.estimate, tracker.estimate.smoother
+    assert estimate.edges is not None and smoother is not None
+    estimate.edges.found = EdgeReview(spread=3.0 * estimate.covariance[:7, :7])
+    assert estimate.for_comparison().variance_ratio == pytest.approx(4.0)
+    smoother.sums.weight = 2.0 * sum(entry.linear.weight for entry in smoother.entries.values())
+    assert estimate.for_comparison().variance_ratio == pytest.approx(2.0)
+
+
+def test_motion_of_images_that_are_forgotten_is_forgotten() -> None:
+    """After an alarm, the images from before it are gone: a start from those since goes on."""
+    window = begun("edges", 0).inputs.window
+    window.forget_images_before(window.next_image - 3)
+    drive, _ = window.drive()
+    stamps = [image.stamp_ns for image in drive.images]
+    assert [(pair.tracks.from_ns, pair.tracks.to_ns) for pair in drive.image_pairs] == list(pairwise(stamps))
+    assert len(camera_steps([drive])) <= len(drive.image_pairs) == 2
+
+
+def test_new_frames_are_compared_with_turned_poses() -> None:
+    tracker = begun("edges", 0)
+    assert not tracker.monitor.turned.gains
+    for position in range(FRAMES, FRAMES + 2):
+        tracker.add(without_labels(simulated(TRACKED_STREET)[position]))
+    turned = tracker.monitor.turned
+    assert len(turned.gains) == len(turned.usual) == 2 and np.mean(turned.usual) > 0.0
+    # Frames that are past the threshold of these are no confirmation.
+    turned.usual.extend([0.1] * 10)
+    turned.gains.extend([np.eye(8)[3]] * 2)
+    assert turned.contradicted and tracker.monitor.contradicted
+    turned.gains.extend([np.eye(8)[3]] * 6)
+    restart = tracker.monitor._turned(tracker.estimate.point, None)
+    assert restart is not None and restart.alarm and restart.scans == 8
 
 
 def test_a_doubt_is_a_status() -> None:
@@ -341,8 +380,12 @@ def test_pictures_of_another_street_are_not_trusted() -> None:
     assert tracker.optimize().status != "ok"
 
 
-def test_a_result_says_why_there_is_no_start() -> None:
+@pytest.mark.parametrize("method", ["edges", "joint"])
+def test_a_result_says_why_there_is_no_start(method: str) -> None:
     street = simulated(TRACKED_STREET)
-    tracker = Tracker(street.camera, config("edges"), street.truth.cTl)
+    tracker = Tracker(street.camera, config(method), street.truth.cTl)
     tracker.initializer.failed("no LiDAR edge in any picture")
-    assert tracker.result().reasons[-1] == "no LiDAR edge in any picture"
+    no_estimate, why = tracker.result().reasons
+    assert "no estimate yet" in no_estimate and why == "no LiDAR edge in any picture"
+    tracker.initializer.restart(tracker.initializer.guess, 0, alarmed=True)
+    assert "the calibration has changed" in tracker.result().reasons[0]

@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 from sst_graph.covariance.error_model import ErrorModel, SideResiduals, fit_error_model
 from sst_graph.covariance.sums import ScoreSums
 from sst_graph.tracker.config import AlarmConfig, TrackerConfig
-from sst_graph.tracker.monitor.confirmation import Confirmation, steps
+from sst_graph.tracker.monitor.confirmation import (
+    DETECTABLE_OFFSET_S,
+    DETECTABLE_TURN_RAD,
+    Confirmation,
+    detectable_steps,
+    steps,
+)
 from sst_graph.tracker.monitor.monitor import Adoption
 from sst_graph.tracker.monitor.statistic import ChangeStatistic, ComparedEstimate, EstimateCovariance
 from sst_graph.tracker.sums.linearized_pair import LinearizedPair
@@ -152,6 +158,39 @@ def test_steps_that_would_be_detected_are_predicted() -> None:
     assert statistic.detectable(compared, tried).tolist() == [False, True]
     stepped = [_score(rng, np.append(tried[:, 1], [0.0, 0.0]), 4 * k) for k in range(4)]
     assert _chi2(stepped, exact) == pytest.approx(large + N, rel=0.3)
+
+
+def test_frames_by_edges_raise_the_alarm_though_their_matches_follow_the_pose() -> None:
+    """The usual size of the statistic says what is noise; how soft matches are, what would have shown."""
+    rng = np.random.default_rng(6)
+    known = _compared(EstimateCovariance(np.zeros((N, N)), (), N))
+    soft, statistic = dataclasses.replace(known, variance_ratio=8.0), ChangeStatistic(25.0)
+    for k in range(40):
+        value = statistic.add([_score(rng, np.zeros(N), 4 * k)], soft)
+        assert not statistic.exceeded
+    assert value is not None and statistic.latest is not None
+    assert value == pytest.approx(statistic.latest.chi2(), rel=0.3)
+    tried = np.zeros((7, 1))
+    tried[6, 0] = 0.35
+    firm = dataclasses.replace(statistic.latest, variance_ratio=1.0)
+    assert firm.chi2_of(tried)[0] > 2.0 * 25.0 > firm.chi2_of(tried)[0] / 4.0
+    assert statistic.detectable(firm, tried).all() and not statistic.detectable(statistic.latest, tried).any()
+    step = np.append(tried[:, 0], [0.0, 0.0])
+    for k in range(8):
+        statistic.add([_score(rng, step, 9000 + 4 * k)], soft)
+    assert statistic.confirmed
+
+
+def test_an_estimate_that_is_less_sure_is_confirmed_by_larger_steps() -> None:
+    T = gtsam.Pose3(gtsam.Rot3.RzRyRx(-1.5, 0.1, -1.6), np.array([0.1, -0.2, 0.3]))
+    sure, wide = np.zeros((7, 7)), np.diag([1.0] * 7)
+    least = steps(T, DETECTABLE_TURN_RAD, DETECTABLE_OFFSET_S)
+    np.testing.assert_allclose(detectable_steps(T, sure), least)
+    np.testing.assert_allclose(detectable_steps(T, wide), 2.0 * least)
+    # One standard deviation of a turn about the camera's x axis.
+    sigma = 0.5 * DETECTABLE_TURN_RAD
+    about_x = steps(T, sigma, 0.0)[:, :1]
+    np.testing.assert_allclose(detectable_steps(T, about_x @ about_x.T), least * [1.5, 1.0, 1.0])
 
 
 def test_turn_and_offset_are_confirmed_apart() -> None:

@@ -11,9 +11,10 @@ from streets import knocked, tracker_from_truth
 
 from sst_graph import Tracker
 from sst_graph.simulator import SimulatedDrive
+from sst_graph.tracker.monitor.change_detector import _KERNEL
 from sst_graph.tracker.track_update import TrackUpdate, current_update
 from sst_graph.tracker.uncertainty import Uncertainty
-from sst_graph.types import Frame
+from sst_graph.types import Frame, SemanticClass
 
 KNOCK_DEG = 1.5
 
@@ -64,6 +65,37 @@ def test_labels_that_always_contradict_do_not_restart_for_ever(
     updates = [tracker.add(frame) for frame in frames[:30]]
     assert sum("estimated again" in update.reason for update in updates) == 2
     assert tracker.estimate.exists
+
+
+def _shifted(frame: Frame, street: SimulatedDrive, instance: int) -> Frame:
+    """The image's labels around one vehicle are moved to the side, and all others as they are."""
+    assert frame.image is not None and frame.scan is not None and frame.scan.instances is not None
+    own = (frame.scan.classes == SemanticClass.VEHICLE) & (frame.scan.instances == instance)
+    cTl = street.truth.cTl
+    uvs = street.camera.project(frame.scan.points[own] @ cTl.rotation().matrix().T + cTl.translation())
+    uvs = uvs[street.camera.in_image(uvs)]
+    if not len(uvs):
+        return frame
+    (left, top), (right, bottom) = uvs.min(axis=0) - 10.0, uvs.max(axis=0) + 10.0
+    mask = frame.image.mask.copy()
+    box = (slice(max(0, int(top)), int(bottom)), slice(max(0, int(left)), int(right)))
+    mask[box] = np.roll(frame.image.mask, 7, axis=1)[box]
+    return dataclasses.replace(frame, image=dataclasses.replace(frame.image, mask=mask))
+
+
+def test_a_start_is_confirmed_though_the_labels_of_one_vehicle_contradict_it(
+    street: SimulatedDrive, frames: list[Frame]
+) -> None:
+    """The others in the same frames would have shown a turn of the camera, and show none."""
+    tracker, instance = tracker_from_truth(street), 34
+    for frame in frames[:15]:
+        tracker.add(_shifted(frame, street, instance) if 8 <= frame.index < 14 else frame)
+    assert tracker.estimate.exists and not tracker.monitor.changes.start_unconfirmed
+    # All together contradict it.
+    changes, estimate = tracker.monitor.changes, tracker.estimate.for_comparison()
+    moving = tracker.inputs.window.dynamics.recently_moving()
+    pairs = changes.matcher.pairs_at(estimate.point, sorted(estimate.scans), _KERNEL)
+    assert changes._largest_of_parts(pairs, estimate, moving)[0] > changes.start_threshold
 
 
 def test_what_only_moving_objects_determine_is_weak(street: SimulatedDrive, frames: list[Frame]) -> None:

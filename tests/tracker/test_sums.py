@@ -124,7 +124,7 @@ def test_parts_of_frames_are_compared_as_each_by_itself(
     alone = [statistic.normalized(statistic.compare(linear[a:b], known)) for a, b in parts]
     assert len({round(value, 6) for value in alone}) == len(parts)
     for part, value in zip(parts, alone, strict=True):
-        found = statistic.largest_of_parts(linear, [part], known)
-        assert found == pytest.approx(value, rel=1e-9)
-    assert statistic.largest_of_parts(linear, parts, known) == pytest.approx(max(alone), rel=1e-9)
-    assert statistic.largest_of_parts(linear, [(1, 1)], known) == 0.0
+        assert statistic.largest_of_parts(linear, [part], known) == (pytest.approx(value, rel=1e-9), part)
+    largest = (pytest.approx(max(alone), rel=1e-9), parts[int(np.argmax(alone))])
+    assert statistic.largest_of_parts(linear, parts, known) == largest
+    assert statistic.largest_of_parts(linear, [(1, 1)], known) == (0.0, (0, 0))

@@ -102,16 +102,17 @@ def review_steps(
     return EdgeReview(reasons, spread_covariance(halves), np.asarray(farther))
 
 
-def variance_ratio(review: EdgeReview, covariance: FloatArray) -> float:
+def variance_ratio(spread: FloatArray, covariance: FloatArray) -> float:
     """How many times the variance of an estimate by edges is that by frozen matches, on average; 1 without
     edges.
 
     Args:
+        spread: (7, 7) covariance of the estimate by what differs from object to object.
         covariance: (m, m) by frozen matches, extrinsic and time offset first.
     """
-    if not review.spread.any():
+    if not spread.any():
         return 1.0
-    return 1.0 + float(np.trace(np.linalg.solve(covariance[:7, :7], review.spread))) / 7.0
+    return 1.0 + float(np.trace(np.linalg.solve(covariance[:7, :7], spread))) / 7.0
 
 
 class Review(SpreadWork[EdgeReview]):
@@ -179,15 +180,18 @@ class EdgeReviews:
             self.review = self._new(matcher, smoother)
             self._advance(None, matcher, guess)
 
-    def covariance(self, smoother: WindowSmoother, uncertainty: Uncertainty) -> FloatArray:
-        """(7, 7) covariance by what all edges have in common, and by which of them are met.
+    def spread(self, smoother: WindowSmoother) -> FloatArray:
+        """(7, 7) covariance of the estimate by what differs from object to object.
 
-        The spread over objects is that of an estimate from the scans of a review alone: of all that the
-        tracker has seen they are a part.
+        A review finds that of an estimate from its scans alone: of all that the tracker has seen they are a
+        part.
         """
         window = sum(entry.linear.weight for entry in smoother.entries.values())
-        of_all = window / max(window + smoother.sums.weight, 1e-9)
-        own = of_all * self.found.spread + self.found.farther + np.diag(FLOOR**2)
+        return np.asarray(window / max(window + smoother.sums.weight, 1e-9) * self.found.spread)
+
+    def covariance(self, smoother: WindowSmoother, uncertainty: Uncertainty) -> FloatArray:
+        """(7, 7) covariance by what all edges have in common, and by which of them are met."""
+        own = self.spread(smoother) + self.found.farther + np.diag(FLOOR**2)
         share, steps = uncertainty.edge_share, uncertainty.edge_steps
         return np.asarray(share @ own @ share.T + steps.T @ steps)
 

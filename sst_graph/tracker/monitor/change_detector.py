@@ -14,11 +14,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sst_graph.factors.robust import RobustKernel
+from sst_graph.graph.matching import PairMatches
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.monitor.confirmation import (
     DETECTABLE_OFFSET_S,
     DETECTABLE_TURN_RAD,
     Confirmation,
+    detectable_steps,
     steps,
 )
 from sst_graph.tracker.monitor.statistic import (
@@ -26,10 +28,12 @@ from sst_graph.tracker.monitor.statistic import (
     FRAMES,
     ChangeStatistic,
     ComparedEstimate,
+    Comparison,
     EstimateCovariance,
 )
 from sst_graph.tracker.start.first_estimate import StartGuess
 from sst_graph.tracker.start.initializer import Restart
+from sst_graph.tracker.sums.linearized_pair import LinearizedPair
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.tracker.window.matcher import WindowMatcher
 
@@ -87,6 +91,7 @@ class ChangeDetector:
     step before it is detected.
 
     Attributes:
+        kernel: under which frames are compared.
         statistic: of the latest frames.
         scans: the latest frames that were compared.
         reference: the estimate from before a suspected change, while there is one.
@@ -100,7 +105,7 @@ class ChangeDetector:
     """
 
     def __init__(self, matcher: WindowMatcher, config: TrackerConfig) -> None:
-        self.matcher, self.config = matcher, config.alarm
+        self.matcher, self.config, self.kernel = matcher, config.alarm, _KERNEL
         sigma_px = config.calibration.noise.object_bias_sigma_px
         self.statistic = ChangeStatistic(config.alarm.chi2, sigma_px)
         self.start_threshold, self.warm_up_scans = _START_CHI2, _WARM_UP_SCANS
@@ -113,6 +118,7 @@ class ChangeDetector:
         self._first_recheck = config.start_scans // 2
         self._start_scan, self._recheck_after = 0, self._first_recheck
         self._before: deque[Reference] = deque(maxlen=FRAMES)
+        self._latest: deque[tuple[Reference, LinearizedPair]] = deque(maxlen=_MAX_PENDING_FRAMES)
         self._unmatched: deque[tuple[bool, frozenset[int]]] = deque(maxlen=_LOST_FRAMES)
         self._moving: set[int] = set()
 
@@ -121,6 +127,7 @@ class ChangeDetector:
         self.statistic.restart()
         self.scans.clear()
         self._before.clear()
+        self._latest.clear()
         self._unmatched.clear()
         self.reference, self.suspected_change = None, ""
 
@@ -141,7 +148,8 @@ class ChangeDetector:
         """
         if not self.config.enabled or self.refused_starts >= _MAX_REFUSED_STARTS:
             return ""
-        value = self._disagreement(estimate, self.matcher.window.dynamics.recently_moving())
+        moving = self.matcher.window.dynamics.recently_moving()
+        value = self._disagreement(estimate, moving, self.start_threshold)
         if value <= self.start_threshold:
             return ""
         self.refused_starts += 1
@@ -165,7 +173,8 @@ class ChangeDetector:
     def confirm_at_end(self, estimate: ComparedEstimate) -> None:
         """The frames of the window confirm the estimate where no part of them contradicts it."""
         moving = self.matcher.window.dynamics.recently_moving()
-        if not self.start_unconfirmed and self._disagreement(estimate, moving) <= self.config.chi2:
+        chi2 = self.config.chi2
+        if not self.start_unconfirmed and self._disagreement(estimate, moving, chi2) <= chi2:
             self.confirmation.begin()
 
     def start_is_over(self, scan: int) -> bool:
@@ -173,32 +182,74 @@ class ChangeDetector:
         return scan - self._start_scan >= self.warm_up_scans or self.refused_starts >= _MAX_REFUSED_STARTS
 
     def _confirm_start(self, estimate: ComparedEstimate, moving: Collection[int], threshold: float) -> None:
-        if self.start_unconfirmed and self._disagreement(estimate, moving) <= threshold:
+        if self.start_unconfirmed and self._disagreement(estimate, moving, threshold) <= threshold:
             self.refused_starts, self.start_unconfirmed = 0, False
 
-    def _disagreement(self, estimate: ComparedEstimate, moving: Collection[int]) -> float:
+    def _disagreement(self, estimate: ComparedEstimate, moving: Collection[int], threshold: float) -> float:
         """Largest statistic of a part of the frames that an estimate was made of, against that estimate.
 
-        The parts are its first ones, its last ones, and any few in a row.
+        The parts are its first ones, its last ones, and any few in a row. An object that alone takes a part
+        past the threshold, while the others in it would have shown what it shows, is wrong itself: it is left
+        out.
         """
         pairs = self.matcher.pairs_at(estimate.point, sorted(estimate.scans), _KERNEL)
-        scores = [
-            self.matcher.linearized({scan: pairs[scan]}, estimate.point, moving) for scan in sorted(pairs)
-        ]
-        n = len(scores)
+        out = set(moving)
+        while True:
+            value, scans = self._largest_of_parts(pairs, estimate, out)
+            if value <= threshold:
+                return value
+            part = {scan: pairs[scan] for scan in scans}
+            odd = self._odd_one_out(part, estimate, out, threshold)
+            if odd is None:
+                return value
+            out.add(odd)
+
+    def _largest_of_parts(
+        self, pairs: Mapping[int, PairMatches], estimate: ComparedEstimate, out: Collection[int]
+    ) -> tuple[float, list[int]]:
+        """The largest statistic of a part of the frames, and the part's scans; 0 and none without any."""
+        scores = [(scan, self.matcher.linearized({scan: pairs[scan]}, estimate.point, out)) for scan in pairs]
+        # A scan whose matches are all left out has no score.
+        scored = [scan for scan, own in scores if own]
+        n = len(scored)
         cuts = range(2, n - 1)
         parts = {
             *((0, k) for k in cuts),
             *((k, n) for k in cuts),
             *((k, k + FRAMES) for k in range(n - FRAMES + 1)),
         }
-        # A scan whose matches are all left out has no score.
-        place = np.cumsum([0, *map(len, scores)]).tolist()
-        return self.statistic.largest_of_parts(
-            [score for own in scores for score in own],
-            {(place[a], place[b]) for a, b in parts},
-            estimate,
+        value, (first, end) = self.statistic.largest_of_parts(
+            [score for _, own in scores for score in own], sorted(parts), estimate
         )
+        return value, scored[first:end]
+
+    def _odd_one_out(
+        self,
+        pairs: Mapping[int, PairMatches],
+        estimate: ComparedEstimate,
+        out: Collection[int],
+        threshold: float,
+    ) -> int | None:
+        """The object without which frames agree with an estimate though they show as much; None without one.
+
+        They must show a turn of the camera without it, and a jump of the clock where they do with it.
+        """
+        tried = steps(estimate.point.cTl, DETECTABLE_TURN_RAD, DETECTABLE_OFFSET_S)
+
+        def compared(*without: int) -> Comparison | None:
+            scores = self.matcher.linearized(pairs, estimate.point, {*without, *out})
+            return self.statistic.compare(scores, estimate) if scores else None
+
+        whole = compared()
+        shown = np.zeros(3, bool) if whole is None else self.statistic.detectable(whole, tried)
+        for track in sorted(self.matcher.objects_of(pairs).difference(out)):
+            others = compared(track)
+            if others is None or self.statistic.normalized(others) > threshold:
+                continue
+            by_others = self.statistic.detectable(others, tried)
+            if by_others[:2].all() and by_others[2] >= shown[2]:
+                return track
+        return None
 
     # ------------------------------------------------------------------ new frames
 
@@ -233,6 +284,7 @@ class ChangeDetector:
         against = self.reference or self._before[-1]
         scores = self.matcher.linearized_at(against.point, list(views), _KERNEL, self._moving)
         value = self.statistic.add(scores, against.compared(estimate))
+        self._latest.extend((self._before[-1], score) for score in scores)
         # 3. Keep the reference, or discard it.
         if self.statistic.exceeded > self.max_pending:
             self.confirmation.unreliable |= self.matcher.objects_of(self.scans) - self._moving
@@ -269,6 +321,11 @@ class ChangeDetector:
         """From the estimate before a change, with the latest scans, which are surely from after it."""
         near = StartGuess(before.cTl, before.time_offset_s, search=self.far)
         return Restart(near, scans, "the calibration has changed", True, chi2)
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether two frames or more in a row are past the threshold, or a change is suspected."""
+        return self.statistic.exceeded > 1 or bool(self.suspected_change)
 
     @property
     def lost(self) -> bool:
@@ -312,8 +369,27 @@ class ChangeDetector:
                 if self.statistic.normalized(comparison) > self.config.chi2:
                     return
         if comparison is not None:
-            tried = steps(estimate.point.cTl, DETECTABLE_TURN_RAD, DETECTABLE_OFFSET_S)
-            self.confirmation.add(self.statistic.detectable(comparison, tried))
+            reported = estimate.covariance.matrix[:7, :7] if estimate.reported is None else estimate.reported
+            tried = detectable_steps(estimate.point.cTl, reported)
+            shown = self.statistic.detectable(comparison, tried)
+            if not (shown.all() or unreliable):
+                # They may do so together with those before them.
+                more = self._with_earlier_frames(estimate)
+                if self.statistic.normalized(more) <= self.config.chi2:
+                    shown |= self.statistic.detectable(more, tried)
+            self.confirmation.add(shown)
+
+    def _with_earlier_frames(self, estimate: ComparedEstimate) -> Comparison:
+        """The latest scans that have been compared, as many as a change may be pending for, against the
+        estimate from before the first of them."""
+        first = self.matcher.window.next_scan - _MAX_PENDING_FRAMES
+        latest = [(before, score) for before, score in self._latest if before.scan >= first]
+        before, _ = latest[0]
+        scores = [
+            replace(score, information=score.information.at(before.point.seen(score.places)))
+            for _, score in latest
+        ]
+        return self.statistic.compare(scores, before.compared(estimate))
 
     def _contradicted(self, reference: Reference, estimate: ComparedEstimate) -> bool:
         """Whether all frames since the reference contradict it.

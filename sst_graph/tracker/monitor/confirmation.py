@@ -15,6 +15,9 @@ DETECTABLE_TURN_RAD = float(np.radians(0.25))
 threshold; under the wide kernel a turn of 1 degree looks like this one [rad]."""
 DETECTABLE_OFFSET_S = 0.01
 """The same of a jump of the clock [s]."""
+_SIGMAS, _MOST = 3.0, 2.0
+"""Where an estimate is less sure, a step by so many standard deviations will do: its covariance covers less.
+At most so many times the above: farther away, edges of pictures do not find their matches any more."""
 _MAX_TURN_AGE_S = 1.0
 """An estimate is unconfirmed where the camera's orientation was not confirmed for longer [s]."""
 _MAX_OFFSET_AGE_S = 3.0
@@ -40,7 +43,11 @@ class Confirmation:
     @property
     def too_old(self) -> bool:
         """Whether the estimate is unconfirmed."""
-        return self.turn_s > _MAX_TURN_AGE_S or self.time_offset_s > _MAX_OFFSET_AGE_S
+        return self.too_old_after(0.0)
+
+    def too_old_after(self, seconds: float) -> bool:
+        """Whether it is once so much more time has passed."""
+        return self.turn_s + seconds > _MAX_TURN_AGE_S or self.time_offset_s > _MAX_OFFSET_AGE_S
 
     def begin(self) -> None:
         """A start confirms everything."""
@@ -59,6 +66,15 @@ class Confirmation:
             self.unreliable.clear()
         if detectable[2]:
             self.time_offset_s = 0.0
+
+
+def detectable_steps(cTl: gtsam.Pose3, covariance: FloatArray) -> FloatArray:
+    """(7, 3) the steps that must have been seen for an estimate with this (7, 7) covariance."""
+    M = cTl.AdjointMap()
+    variances = np.append(np.diag(M @ covariance[:6, :6] @ M.T)[:2], covariance[6, 6])
+    least = np.array([DETECTABLE_TURN_RAD, DETECTABLE_TURN_RAD, DETECTABLE_OFFSET_S])
+    sizes = np.clip(_SIGMAS * np.sqrt(np.maximum(variances, 0.0)), least, _MOST * least)
+    return np.asarray(steps(cTl, 1.0, 1.0) * sizes)
 
 
 def steps(cTl: gtsam.Pose3, turn_rad: float, time_offset_s: float) -> FloatArray:

@@ -14,6 +14,7 @@ import numpy as np
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.estimate import FrameMatches, OnlineEstimate
 from sst_graph.tracker.monitor.change_detector import ChangeDetector
+from sst_graph.tracker.monitor.turned_poses import TurnedPoses
 from sst_graph.tracker.start.first_estimate import StartGuess
 from sst_graph.tracker.start.initializer import Restart
 from sst_graph.tracker.window.gaussian import Point
@@ -79,22 +80,31 @@ class Monitor:
     Attributes:
         changes: whether the calibration has changed.
         adoption: the calibration in use, validated on held-out frames.
+        turned: whether new frames agree with a turned pose instead, where edges are aligned.
     """
 
     def __init__(self, matcher: WindowMatcher, config: TrackerConfig) -> None:
         self.matcher = matcher
         self.changes = ChangeDetector(matcher, config)
         self.adoption = Adoption()
+        self.turned = TurnedPoses()
 
     def begin(self, scan: int) -> None:
         """An estimate begins; the scan of this number comes next."""
         self.changes.begin(scan)
         self.adoption.restart()
+        self.turned.restart()
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether the latest frames contradict the estimate: until it is known why, it is not confirmed."""
+        return self.changes.contradicted or self.turned.contradicted
 
     def restart(self) -> None:
         """The calibration is estimated again."""
         self.changes.restart()
         self.adoption.restart()
+        self.turned.restart()
 
     def check(self, matches: FrameMatches, estimate: OnlineEstimate) -> tuple[float | None, Restart | None]:
         """Compare new frames, before they are used, with the estimate and with the calibration in use.
@@ -106,6 +116,10 @@ class Monitor:
         compared = estimate.for_comparison()
         chi2 = self.changes.check(sorted(matches.waiting), counts, compared)
         change = self.changes.change(compared, chi2)
+        if change is None and estimate.edges is not None and matches.new:
+            wide = partial(self.matcher.cost, chosen=matches.new, kernel=self.changes.kernel)
+            self.turned.add(wide, estimate.point)
+            change = self._turned(estimate.point, chi2)
         if change is not None:
             if self.changes.start_is_over(matches.scan):
                 return chi2, change
@@ -117,6 +131,14 @@ class Monitor:
             cost = partial(self.matcher.cost, chosen=matches.new)
             self.adoption.add_held_out(cost, estimate.point, estimate.guessed_point)
         return chi2, None
+
+    def _turned(self, point: Point, chi2: float | None) -> Restart | None:
+        """The restart where new frames agree with a turned pose."""
+        pose = self.turned.better(point) if self.changes.config.enabled else None
+        if pose is None:
+            return None
+        near = StartGuess(pose.cTl, pose.time_offset_s)
+        return Restart(near, len(self.turned.gains), "the calibration has changed", True, chi2)
 
     def check_start_at_end(self, estimate: OnlineEstimate) -> None:
         """At the end of a drive: check a start without later frames against its own frames; an estimate by

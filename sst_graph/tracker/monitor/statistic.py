@@ -71,6 +71,7 @@ class ComparedEstimate:
         scans: numbers of the scans that it was made of.
         variance_ratio: how many times the variance of the scores is that of frozen matches: edges of pictures
             follow the pose, contours of masks do not.
+        reported: (7, 7) covariance of extrinsic and time offset that is reported; None: as in ``covariance``.
     """
 
     point: Point
@@ -78,6 +79,7 @@ class ComparedEstimate:
     model: ErrorModel
     scans: tuple[int, ...] = ()
     variance_ratio: float = 1.0
+    reported: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -213,18 +215,25 @@ class ChangeStatistic:
         scores: Sequence[LinearizedPair],
         parts: Collection[tuple[int, int]],
         estimate: ComparedEstimate,
-    ) -> float:
-        """Largest :meth:`normalized` statistic of parts (start, end) of the scores; 0 without any."""
+    ) -> tuple[float, tuple[int, int]]:
+        """Largest :meth:`normalized` statistic of parts (start, end) of the scores, and which part has it; 0
+        and (0, 0) without any."""
         compared = ComparedScores.of(scores, estimate, self.object_sigma_px)
-        return max((self.normalized(compared.part(a, b)) for a, b in parts if b > a), default=0.0)
+        values = {(a, b): self.normalized(compared.part(a, b)) for a, b in parts if b > a}
+        largest = max(values, key=values.__getitem__, default=(0, 0))
+        return values.get(largest, 0.0), largest
 
     def normalized(self, comparison: Comparison) -> float:
         """T over its usual size."""
         return comparison.chi2() / self._scale(comparison)
 
     def detectable(self, comparison: Comparison, steps: FloatArray) -> NDArray[np.bool_]:
-        """(k,) which steps (7, k) of extrinsic and offset would be past the threshold."""
-        return np.asarray(comparison.chi2_of(steps) > self.threshold * self._scale(comparison))
+        """(k,) which steps (7, k) of extrinsic and offset would be past the threshold.
+
+        Matches that follow the pose show a step by so many times less than frozen ones.
+        """
+        shown = comparison.chi2_of(steps) / comparison.variance_ratio
+        return np.asarray(shown > self.threshold * self._usual_scale(comparison))
 
     @property
     def confirmed(self) -> bool:
@@ -232,12 +241,18 @@ class ChangeStatistic:
         return self.exceeded >= CONFIRMATIONS
 
     def _scale(self, comparison: Comparison) -> float:
-        """How much larger than chi-squared's the usual 90th percentile is; at least the variance ratio."""
+        """How much larger than chi-squared T is; before that is known, the variance ratio bounds it."""
         if len(self.usual) < _LEAST_USUAL_FRAMES:
             return comparison.variance_ratio
+        return self._usual_scale(comparison)
+
+    def _usual_scale(self, comparison: Comparison) -> float:
+        """How much larger than chi-squared's the usual 90th percentile is; 1 where that is not known."""
+        if len(self.usual) < _LEAST_USUAL_FRAMES:
+            return 1.0
         freedom = len(comparison.gradient)
         expected = freedom + 1.28 * float(np.sqrt(2.0 * freedom))
-        return max(comparison.variance_ratio, float(np.quantile(self.usual, 0.9)) / expected)
+        return max(1.0, float(np.quantile(self.usual, 0.9)) / expected)
 
 
 def _squared(gradient: FloatArray, variance: FloatArray) -> float:

@@ -79,7 +79,7 @@ class Initialization:
 
     def for_comparison(self) -> ComparedEstimate:
         """For the comparison of frames with it."""
-        ratio = variance_ratio(self.first.review, self.uncertainty.covariance)
+        ratio = variance_ratio(self.first.review.spread, self.uncertainty.covariance)
         return self.uncertainty.compared(self.smoother, ratio)
 
 
@@ -294,5 +294,5 @@ class Initializer:
 
     def succeeded(self) -> None:
         """There is an estimate."""
-        self.alarmed, self.attempts, self.waited = False, 0, 0
+        self.alarmed, self.attempts, self.waited, self.why = False, 0, 0, ""
         self.search = self.graph = None

@@ -176,15 +176,20 @@ class WindowMatcher:
                     terms[c] = {name: column[kept] for name, column in pair.terms[c].items()}
         return replace(pair, matches=matches, tracks=own, terms=terms)
 
-    def cost(self, point: Point, chosen: Collection[int]) -> float | None:
-        """Mean cost of the boundary points of some scans at a point; None where none is in view."""
-        if self._last is not None and self._last[0] is point:
+    def cost(self, point: Point, chosen: Collection[int], kernel: RobustKernel | None = None) -> float | None:
+        """Mean cost of the boundary points of some scans at a point; None where none is in view.
+
+        Args:
+            kernel: None for that of the estimate.
+        """
+        kernel = kernel or self.kernel
+        if self._last is not None and self._last[0] is point and kernel == self.kernel:
             pairs = {number: pair for number, pair in self._last[1].items() if number in chosen}
         else:
-            pairs, _ = self._pairs(point, chosen, self.kernel)
+            pairs, _ = self._pairs(point, chosen, kernel)
         scans, below = dict(self.window.scans), self.graph.lower_edges
         counted = [(pair, boundary_count(scans[number], below)) for number, pair in pairs.items()]
-        return mean_cost(counted, point, self.classes, self.kernel)
+        return mean_cost(counted, point, self.classes, kernel)
 
     def _pairs(
         self, point: Point, chosen: Collection[int] | None, kernel: RobustKernel

@@ -24,6 +24,8 @@ from sst_graph.types import RelativeMotion, SemanticClass
 
 FloatArray = NDArray[np.float64]
 
+FARTHEST_NS = 86_400 * 10**9
+"""A stamp that is farther ahead of the one before is an error, not a pause: a day [ns]."""
 OBJECT_MEMORY = 50
 """Scans after which an object that was not seen again is another one."""
 
@@ -105,6 +107,12 @@ class Window:
     def last_stamp_ns(self) -> int | None:
         """Stamp of the newest scan."""
         return self.scans[-1][1].stamp_ns if self.scans else None
+
+    def seconds_since_scan(self, stamp_ns: int) -> float:
+        """Time from the newest scan to a stamp; 0 where there is none, or for a stamp that is an error."""
+        newest = self.last_stamp_ns
+        later = 0 if newest is None else stamp_ns - newest
+        return 1e-9 * later if 0 < later <= FARTHEST_NS else 0.0
 
     def latest_step(self) -> tuple[float, float]:
         """Seconds from the scan before to the newest one, and the LiDAR's speed; 0 if unknown [m/s]."""
@@ -259,13 +267,18 @@ class Window:
             # As in a drive: the k-th motion leads from the k-th scan to the next.
             motions = tuple(motion for motion in motions if motion.from_ns >= scans[0].stamp_ns)
         images = tuple(self.images)
+        # Images are forgotten on their own.
+        stamps = {image.stamp_ns for image in images}
+        pairs = (
+            pair for pair in self.image_pairs if stamps.issuperset((pair.tracks.from_ns, pair.tracks.to_ns))
+        )
         drive = Drive(
             "window",
             self.camera,
             tuple(scans),
             images,
             motions,
-            tuple(self.image_pairs),
+            tuple(pairs),
             origin_ns=self.origin_ns,
             labelled_ns=(frozenset(self.labelled_ns[0]), frozenset(self.labelled_ns[1])),
         )
