@@ -1,4 +1,4 @@
-"""Settings given by an earlier name: read under their name, or refused with what replaces them."""
+"""Settings given by an earlier name: read under the name that they have."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import logging
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from sst_graph.config.renamed import CONSTANTS, RENAMED
+from sst_graph.config.renamed import FIXED, RENAMED
 from sst_graph.config.settings import join, walk_settings
 from sst_graph.config.values import printable, shown
 from sst_graph.errors import ConfigError
@@ -24,17 +24,13 @@ def with_new_names(
     cls: Any,
     data: Mapping[str, Any],
     renamed: Mapping[str, str] = RENAMED,
-    constants: Mapping[str, str] = CONSTANTS,
 ) -> Mapping[str, Any]:
     """Nested settings for ``cls`` under the names that they have; each old name is logged as a warning.
 
-    A name that ``cls`` does not have, and the tables do not, stays: whoever reads it refuses it.
-
-    Args:
-        renamed, constants: as the tables of :mod:`sst_graph.config.renamed`.
+    A name that neither ``cls`` nor ``renamed`` has stays: whoever reads it refuses it.
 
     Raises:
-        ConfigError: a setting that is a constant, or one that is given under two names.
+        ConfigError: a setting that is given under two names.
     """
     known = {name for name, _, _ in walk_settings(cls)}
     old = {name: value for name, value in _leaves(data) if name not in known}
@@ -42,8 +38,6 @@ def with_new_names(
     for name, value in old.items():
         short = name.removeprefix(CALIBRATION)
         prefix = name[: len(name) - len(short)]
-        if short in constants:
-            raise ConfigError(f"'{printable(name)}' is not a setting: {constants[short]}; leave it out")
         new = prefix + renamed.get(short, short)
         if new != name and new in known:
             _LOG.warning("setting '%s' is called '%s': use that name", name, new)
@@ -63,6 +57,14 @@ def with_new_names(
             )
         _put(tree, new, value)
     return tree
+
+
+def fixed_in(name: str, fixed: Mapping[str, str] = FIXED) -> str:
+    """The module that fixes what an earlier setting set; empty for a name that never was one."""
+    place = name.removeprefix(CALIBRATION)
+    while place and place not in fixed:
+        place = place.rpartition(".")[0]
+    return fixed.get(place, "")
 
 
 def _leaves(data: Mapping[str, Any], where: str = "") -> Iterator[tuple[str, Any]]:
