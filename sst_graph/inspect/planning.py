@@ -80,10 +80,6 @@ class Prediction(ByValue):
     bits: float
     enough: int | None
 
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
-        return {**dataclasses.asdict(self), "sigmas": self.sigmas.tolist()}
-
 
 @dataclass(frozen=True)
 class View:
@@ -123,19 +119,6 @@ class Plan:
     def best(self) -> Prediction:
         """The best motion."""
         return self.motions[0]
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able; sigmas in the covariance's order [rad, m, s]."""
-        return {
-            "count": self.count,
-            "now": self.now.to_dict(),
-            "elsewhere": self.elsewhere.to_dict(),
-            "motions": [motion.to_dict() for motion in self.motions],
-            "nearer": self.nearer.to_dict(),
-            "views": [
-                {"position": view.position, "prediction": view.prediction.to_dict()} for view in self.views
-            ],
-        }
 
 
 def plan_recording(result: CalibrationResult, frames: Sequence[FrameInformation], count: int) -> Plan:

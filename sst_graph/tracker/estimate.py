@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.assumptions.sweep import SWEEP
+from sst_graph.assumptions.of_time import SWEEP
 from sst_graph.batch.assumption_tests import ParameterTest, with_test_results
 from sst_graph.covariance.considered import Considered, considered_by_steps
 from sst_graph.covariance.undecided_sweep import SweepEffect
