@@ -77,16 +77,6 @@ def is_number(value: Any) -> TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MAX_SIGMA
 
 
-def put_line(lines: dict[str, FloatArray], name: str, values: FloatArray, place: str) -> None:
-    """Keep a named line's values.
-
-    Raises:
-        DataError: an earlier line of this name has others.
-    """
-    if not np.array_equal(lines.setdefault(name, values), values):
-        raise DataError(place, f"another {name} than above", f"one line {name}")
-
-
 def read_only(values: FloatArray) -> FloatArray:
     """A copy that cannot be written to: what is frozen does not change with the caller's array."""
     copy = np.array(values, dtype=np.float64)

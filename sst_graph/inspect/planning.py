@@ -125,14 +125,14 @@ def plan_recording(result: CalibrationResult, frames: Sequence[FrameInformation]
     """Predictions for ``count`` further frames; ``frames`` is not empty."""
     limits, lasting = limits_of(result), considered_covariance(result)
     views = np.stack([frame.view for frame in frames])
-    proposals = motion_proposals(result.T_camera_lidar, frames, views.mean(axis=0))
+    twists = motion_twists(result.T_camera_lidar, frames)
+    proposals = [Proposal(way, _mean_information(views.mean(axis=0), each)) for way, each in twists.items()]
     again = Proposal("as in this record", np.mean([frame.information for frame in frames], axis=0))
 
     def predicted(proposal: Proposal, number: int = count, search: bool = True) -> Prediction:
         return predict(result.covariance, proposal, number, limits, search, lasting)
 
     motions = sorted((predicted(p) for p in (*proposals, again)), key=lambda p: (p.worst, -p.bits))
-    twists = motion_twists(result.T_camera_lidar, frames)
     best = next((name for name in (motion.name for motion in motions) if name in twists), "standing")
     halved = nearer(views.mean(axis=0), result.T_camera_lidar)
     by_view = [
@@ -225,15 +225,6 @@ def _numbers(entry: Any) -> FloatArray | None:
     except (KeyError, TypeError, ValueError, OverflowError):
         return None
     return numbers if numbers.shape == (8,) and (np.abs(numbers) <= MAX_NUMBER).all() else None
-
-
-def motion_proposals(
-    cTl: gtsam.Pose3, frames: Sequence[FrameInformation], view: FloatArray
-) -> list[Proposal]:
-    """Ways to drive, all with one view (6, 6)."""
-    return [
-        Proposal(name, _mean_information(view, twists)) for name, twists in motion_twists(cTl, frames).items()
-    ]
 
 
 def motion_twists(cTl: gtsam.Pose3, frames: Sequence[FrameInformation]) -> dict[str, FloatArray]:
