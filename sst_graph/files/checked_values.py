@@ -11,13 +11,11 @@ from typing import Any, TypeGuard
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
 from sst_graph.factors.arguments import described
 from sst_graph.factors.camera import PinholeCamera
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 ROTATION_TOLERANCE = 1e-3
 """Largest entry of R R' - I that is put down to rounding in a file."""

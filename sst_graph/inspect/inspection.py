@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.covariance.observability import ObservabilityConfig, weak_directions
 from sst_graph.errors import ConfigError, DataError
@@ -22,9 +21,7 @@ from sst_graph.inspect.gained import Gained, gained_of
 from sst_graph.inspect.pixels import pixel_covariance
 from sst_graph.inspect.planning import Plan, limits_of, plan_recording
 from sst_graph.result import CalibrationResult, Sigmas, WeakDirection
-from sst_graph.types import ByValue
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import ByValue, FloatArray
 
 NAMES = ("rotation x", "rotation y", "rotation z", "x", "y", "z", "time offset")
 UNITS = ("deg", "deg", "deg", "cm", "cm", "cm", "ms")

@@ -17,7 +17,6 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.covariance.observability import ObservabilityConfig, worst_ratio
 from sst_graph.inspect.frame_information import (
@@ -28,9 +27,7 @@ from sst_graph.inspect.frame_information import (
     with_offset,
 )
 from sst_graph.result import CalibrationResult
-from sst_graph.types import ByValue
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import ByValue, FloatArray
 
 ASSUMPTIONS = "assumptions"
 """Key among a result's diagnostics of what it assumes: by name, deviation and sensitivity."""

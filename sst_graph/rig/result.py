@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.factors.arguments import checked_type
@@ -25,8 +24,7 @@ from sst_graph.files.strict_json import strict_json
 from sst_graph.result import CALIBRATION_NAME, RIG_NAME, CalibrationResult, Status, check_status, read_result
 from sst_graph.rig.known import KnownPose, KnownRig
 from sst_graph.rig.marginal import RelativePose, RigMarginal
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 FORMAT = "sst-graph/rig"
 VERSION = 1

@@ -22,11 +22,9 @@ from sst_graph.errors import ConfigError, MissingDependencyError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.inspect.inspection import HUMAN
 from sst_graph.tracker.track_update import TrackUpdate
-from sst_graph.types import Calibration, SemanticClass
+from sst_graph.types import Calibration, FloatArray, SemanticClass
 from sst_graph.viewer.frame_view import FrameView, MatchView
 from sst_graph.viz.overlay import CLASS_COLOURS, IN_MASK, OTHER_COLOUR
-
-FloatArray = NDArray[np.float64]
 
 LIDAR = "world/lidar"
 CAMERA = f"{LIDAR}/camera"

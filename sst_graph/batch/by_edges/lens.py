@@ -19,7 +19,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.assumptions import ASSUMPTIONS, named_sigmas
 from sst_graph.batch.assumption_tests import ParameterTest, few_objects_factor
@@ -37,9 +36,7 @@ from sst_graph.graph.outer_loop import JointProblem, support_of
 from sst_graph.graph.state import State, difference
 from sst_graph.objects.tracks import ObjectId
 from sst_graph.stepwise import Stepwise, run_to_end
-from sst_graph.types import Guess
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray, Guess
 
 MATTERS_SIGMAS = 2.0
 """A step longer than this many standard deviations, on any axis, is a reason against an estimate; one that is

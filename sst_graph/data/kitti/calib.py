@@ -13,14 +13,12 @@ from pathlib import Path
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.files.checked_values import checked_pose, pinhole_camera
 from sst_graph.files.reading import CALIB_TXT, read_text
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 _LINE = re.compile(r"P\d|Tr")
 MAX_ENTRY = 1e12

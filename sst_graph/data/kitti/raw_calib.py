@@ -22,8 +22,7 @@ from sst_graph.cameras.readers import camera_from_kitti_raw
 from sst_graph.data.kitti.calib import KittiCalibration, numbers_by_name, pose_from
 from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.files.reading import FileKind, read_text
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 KITTI_RAW_CALIB = FileKind("a KITTI raw calibration", 1024 * 1024)
 _LINE = re.compile(r"(?:[KDRTS]|[RSP]_rect)_\d\d|R|T", re.ASCII)
