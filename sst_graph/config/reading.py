@@ -24,7 +24,7 @@ def from_dict(cls: type[T], data: Mapping[str, Any], base: T | None = None) -> T
     """A ``cls`` with the values of ``data``; what is not named is as in ``base``, or keeps its default, in
     nested tables too.
 
-    Old names of settings (:mod:`sst_graph.config.renamed`) are accepted with a warning in the log.
+    Old names of settings (:mod:`sst_graph.config.old_names`) are accepted with a warning in the log.
 
     Raises:
         ConfigError: an unknown key, a value of a wrong type or out of its range, a missing key.

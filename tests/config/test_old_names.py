@@ -12,8 +12,7 @@ import pytest
 
 from sst_graph.batch import CalibrationConfig
 from sst_graph.config import Settings, from_dict, setting, to_dict, walk_settings
-from sst_graph.config.old_names import fixed_in, with_new_names
-from sst_graph.config.renamed import FIXED, RENAMED
+from sst_graph.config.old_names import FIXED, RENAMED, fixed_in, with_new_names
 from sst_graph.errors import ConfigError
 from sst_graph.experiments.registry import EXPERIMENTS
 from sst_graph.tracker.config import TrackerConfig
@@ -119,7 +118,7 @@ def test_what_the_tables_do_not_know_stays_to_be_refused(data: dict[str, Any]) -
 
 
 def test_a_value_in_the_place_of_the_new_table_is_refused() -> None:
-    with pytest.raises(ConfigError, match="lower_edges: found 3, expected a table"):
+    with pytest.raises(ConfigError, match=r"'undersides\.use' and 'lower_edges': found both"):
         from_dict(Method, new(Method, {"lower_edges": 3, "undersides": {"use": True}}))
 
 
