@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.data.ros.messages import BagWriter, MessageMaker
-from sst_graph.errors import optional_module
+from sst_graph.errors import MissingDependencyError
 from sst_graph.simulator.drive import RawFrame, SimulatedDrive
 from sst_graph.simulator.surfaces import CITYSCAPES, SEMANTIC_KITTI
 
@@ -35,9 +35,14 @@ def write_bag(drive: SimulatedDrive, path: str | Path, labels: bool = True) -> P
         MissingDependencyError: ``rosbags`` is not installed.
         rosbags.rosbag2.WriterError: ``path`` is there already.
     """
-    rosbag2 = optional_module("rosbags.rosbag2", "bags need rosbags, which is not installed", "ros")
+    try:
+        from rosbags.rosbag2 import StoragePlugin, Writer
+    except ImportError:
+        raise MissingDependencyError(
+            "bags need rosbags, which is not installed: pip install 'sst-graph[ros]'"
+        ) from None
     make = MessageMaker()
-    with rosbag2.Writer(Path(path), version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
+    with Writer(Path(path), version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         bag = BagWriter(make, writer)
         extrinsic = {(CAMERA_FRAME, LIDAR_FRAME): drive.nominal}
         bag.add("/tf_static", make.transforms(extrinsic, EPOCH_NS), EPOCH_NS)
