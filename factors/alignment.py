@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from .arguments import checked_array, checked_number, checked_positive, checked_type, described
+from .arguments import FloatArray, checked_array, checked_number, checked_positive, checked_type, described
 from .condensed import condense_gram, condense_root, cost_rows
 from .custom.factor import custom_factor, recipe_of
 from .custom.variables import Argument, Variables, Vector, checked_key, is_key, number_or_key, pose_or_key
@@ -40,7 +40,6 @@ __all__ = [
     "weighted_residuals",
 ]
 
-FloatArray = NDArray[np.float64]
 _COLUMNS = {"cTl": range(0, 6), "time_offset_s": range(6, 7), "c_twist": range(7, 13)}
 """Where each quantity stands among the Jacobian's columns; biases follow, the residual is last."""
 _NAME = "frame_factor"

@@ -7,9 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .arguments import checked_count, checked_number, checked_positive, checked_rows
-
-FloatArray = NDArray[np.float64]
+from .arguments import FloatArray, checked_count, checked_number, checked_positive, checked_rows
 
 MIN_DEPTH_M = 0.1
 """Points nearer to the image plane than this [m], or behind it, are not projected."""

@@ -16,9 +16,8 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
-from .arguments import checked_number, checked_positive, checked_type
+from .arguments import FloatArray, checked_number, checked_positive, checked_type
 from .custom.factor import custom_factor
 from .custom.variables import (
     Argument,
@@ -33,7 +32,6 @@ from .custom.variables import (
 from .errors import FactorError
 from .hand_eye import CameraMotion, MotionError, camera_motion_error
 
-FloatArray = NDArray[np.float64]
 _NAME = "camera_motion_factor"
 
 

@@ -11,12 +11,10 @@ from functools import partial
 
 import gtsam
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .arguments import checked_covariance, checked_gtsam
+from .arguments import FloatArray, checked_covariance, checked_gtsam
 from .custom.factor import custom_factor
-
-FloatArray = NDArray[np.float64]
 
 
 def camera_pose_factor(E_b: int, E_c: int, cTb: gtsam.Pose3, covariance: ArrayLike) -> gtsam.CustomFactor:

@@ -8,12 +8,9 @@ linear system in cols + 1 rows.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .arguments import as_numbers, checked_array, checked_number, described
+from .arguments import FloatArray, as_numbers, checked_array, checked_number, described
 from .errors import FactorError
-
-FloatArray = NDArray[np.float64]
 
 
 def gram(rows: FloatArray) -> FloatArray:

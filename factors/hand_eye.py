@@ -19,14 +19,19 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .arguments import checked_array, checked_covariance, checked_gtsam, checked_number, checked_type
+from .arguments import (
+    FloatArray,
+    checked_array,
+    checked_covariance,
+    checked_gtsam,
+    checked_number,
+    checked_type,
+)
 from .custom.factor import ResidualFunction, custom_factor
 from .custom.variables import Kind, Vector
 from .errors import FactorError
-
-FloatArray = NDArray[np.float64]
 
 MotionError = Callable[[gtsam.Pose3, bool], tuple[FloatArray, FloatArray | None]]
 """Of a predicted motion of the camera: error (6,) and derivative (6, 6) by its right perturbation."""

@@ -9,13 +9,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from .arguments import as_numbers, checked_array, checked_number_or_array, checked_type, described
+from .arguments import FloatArray, as_numbers, checked_array, checked_number_or_array, checked_type, described
 from .camera import PinholeCamera
 from .errors import FactorError, count_of
 from .motion import MotionModel, checked_model
 from .robust import RobustKernel
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

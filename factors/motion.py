@@ -33,6 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arguments import (
+    FloatArray,
     as_numbers,
     checked_array,
     checked_gtsam,
@@ -42,7 +43,6 @@ from .arguments import (
 )
 from .errors import FactorError
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 MotionModel = Literal["se3", "translation"]
 

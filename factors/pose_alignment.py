@@ -18,18 +18,15 @@ from typing import Any, cast
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from .alignment import FrameResidual, GroupedBias, Quantities, frame_residual, image_factor
-from .arguments import checked_type
+from .arguments import FloatArray, checked_type
 from .camera_motion import Between
 from .condensed import condense_gram
 from .custom.variables import Argument, Variables, Vector, number_or_key, pose_or_key
 from .errors import FactorError
 from .matches import Alignment
 from .motion import se3_left_jacobian, twist_ad
-
-FloatArray = NDArray[np.float64]
 
 
 def pose_alignment_factor(

@@ -12,13 +12,10 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
-from .arguments import checked_gtsam, checked_number, checked_positive
+from .arguments import FloatArray, checked_gtsam, checked_number, checked_positive
 from .custom.factor import custom_factor
 from .custom.variables import checked_key, checked_keys
-
-FloatArray = NDArray[np.float64]
 
 
 def time_offset_prior(

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arguments import (
+    FloatArray,
     as_numbers,
     checked_array,
     checked_gtsam,
@@ -34,8 +35,6 @@ from .condensed import gram, square_root
 from .errors import FactorError
 from .matches import Alignment
 from .motion import CameraTwist, GroupsMoved, PointwiseMoved, RigidlyMoved, moved_points
-
-FloatArray = NDArray[np.float64]
 
 
 @overload

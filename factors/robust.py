@@ -6,12 +6,11 @@ from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .arguments import as_numbers, checked_positive, described
+from .arguments import FloatArray, as_numbers, checked_positive, described
 from .errors import FactorError
 
-FloatArray = NDArray[np.float64]
 KernelKind = Literal["none", "huber", "cauchy", "geman_mcclure", "tukey"]
 
 

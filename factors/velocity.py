@@ -10,15 +10,20 @@ from functools import partial
 
 import gtsam
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .arguments import checked_array, checked_covariance, checked_number, checked_positive, checked_type
+from .arguments import (
+    FloatArray,
+    checked_array,
+    checked_covariance,
+    checked_number,
+    checked_positive,
+    checked_type,
+)
 from .custom.factor import custom_factor
 from .custom.variables import Kind, Vector, checked_key, checked_keys
 from .errors import FactorError
 from .motion import twist_ad
-
-FloatArray = NDArray[np.float64]
 
 LOW_SPEED_MPS = 0.5
 """Below this speed [m/s] a direction of motion is known less and less well; see velocity_direction_factor."""

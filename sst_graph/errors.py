@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 from pathlib import Path
+from typing import Any
 
 from sst_graph.factors.errors import SstGraphError, count_of, printable
 
@@ -16,6 +18,7 @@ __all__ = [
     "count_of",
     "first_line",
     "one_line",
+    "optional_module",
     "printable",
 ]
 
@@ -57,6 +60,22 @@ class ContradictionError(EstimationError):
 
 class MissingDependencyError(SstGraphError):
     """An optional dependency is not installed; the message names the extra to install."""
+
+
+def optional_module(name: str, without: str, extra: str) -> Any:
+    """A module of an optional dependency.
+
+    Args:
+        without: that it is not installed, in a sentence.
+        extra: of this package, which brings it.
+
+    Raises:
+        MissingDependencyError: it is not installed.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise MissingDependencyError(f"{without}: pip install 'sst-graph[{extra}]'") from error
 
 
 def one_line(error: BaseException) -> str:

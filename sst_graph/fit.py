@@ -14,10 +14,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.types import ByValue
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from sst_graph.types import ByValue, FloatArray, IntArray
 
 CLOSE_PX = 1.5
 """A boundary point closer to its contour than this counts as close [px].

@@ -25,7 +25,6 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.errors import DataError, EstimationError, count_of
 from sst_graph.factors.arguments import checked_array, checked_gtsam, checked_number, checked_type, described
@@ -34,9 +33,7 @@ from sst_graph.factors.errors import FactorError
 from sst_graph.files.checked_values import checked_pose, checked_text
 from sst_graph.files.json_table import JsonTable, json_table
 from sst_graph.files.reading import MARGINAL, parse_json, read_text
-from sst_graph.types import ByValue, Calibration
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import ByValue, Calibration, FloatArray
 
 FORMAT = "sst-graph/marginal"
 VERSION = 1

@@ -9,13 +9,10 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
 from sst_graph.files.checked_values import MAX_SIGMA
-from sst_graph.types import GroundTruth
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray, GroundTruth
 
 FORWARD_R_OPTICAL = gtsam.Rot3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
 """Optical camera axes (x right, y down, z forward) turned to vehicle axes (x forward, y left, z up)."""

@@ -16,7 +16,6 @@ from typing import Any, Literal, cast, get_args
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
 from sst_graph.factors.arguments import checked_type
@@ -32,9 +31,8 @@ from sst_graph.files.json_table import JsonTable, json_table
 from sst_graph.files.reading import CALIBRATION, parse_json, path_of, read_text
 from sst_graph.files.strict_json import strict_json
 from sst_graph.fit import Fit
-from sst_graph.types import ByValue
+from sst_graph.types import ByValue, FloatArray
 
-FloatArray = NDArray[np.float64]
 Status = Literal["ok", "unobservable", "not_converged"]
 
 CALIBRATION_NAME, RIG_NAME = "calibration.json", "rig.json"

@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import ConfigError
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 SweepStamp = Literal["forward", "start", "end"]
 """The instant that a scan's stamp names: the laser faces forward, the turn begins, the turn ends."""

@@ -20,6 +20,8 @@ from sst_graph.factors.arguments import checked_gtsam, checked_number
 from sst_graph.factors.camera import PinholeCamera
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
 
 
 class ByValue:

@@ -25,8 +25,8 @@ from sst_graph.data.rectified import RectifiedSource
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.metrics import CalibrationErrors, calibration_errors
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
-from sst_graph.simulator.camera.lens import LensDrive
 from sst_graph.types import Source
+from studies.simulators.lens import LensDrive
 
 FISHEYE_DEG = 190.0
 

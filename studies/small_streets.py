@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -130,7 +130,12 @@ def row(seed: int, simulator: str, case: str, drive: KeptDrive) -> Row:
     )
 
 
-def rows(task: Task) -> list[Row]:
+def rows(tasks: Sequence[Task]) -> Iterator[list[Row]]:
+    """All calibrations of each street."""
+    yield from map(rows_of_street, tasks)
+
+
+def rows_of_street(task: Task) -> list[Row]:
     """All calibrations of a street."""
     simulator, drive = street(task.seed)
     found = [row(task.seed, simulator, "clean", drive)]
@@ -169,8 +174,7 @@ def main() -> None:
     args = parser.parse_args()
     cv2.setNumThreads(1)
     work = Work(rows, Row, records=args.records)
-    tasks = [Task(args.seed + number) for number in range(args.streets)]
-    print(table([one for each in rows_of(work, tasks) for one in each]))
+    print(table(rows_of(work, [[Task(args.seed + number)] for number in range(args.streets)])))
 
 
 if __name__ == "__main__":

@@ -17,13 +17,11 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arguments import as_numbers, checked_count, checked_type, described, other_signature
+from ..arguments import FloatArray, as_numbers, checked_count, checked_type, described, other_signature
 from ..errors import FactorError, count_of
 from .variables import Kind, Reader, checked_key, checked_keys, dimension, key_name
 
-FloatArray = NDArray[np.float64]
 Jacobians = Sequence[FloatArray] | None
 ResidualFunction = Callable[..., tuple[FloatArray, Jacobians]]
 """``function(*values, jacobians: bool) -> (error (rows,), [H (rows, dim), ...] or None)``."""

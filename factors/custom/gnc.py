@@ -10,14 +10,11 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arguments import checked_number, checked_positive, checked_type, described, is_whole
+from ..arguments import FloatArray, checked_number, checked_positive, checked_type, described, is_whole
 from ..errors import FactorError
 from .cloning import checked_graph, own_recipe
 from .variables import checked_values, factors_of
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

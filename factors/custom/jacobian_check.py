@@ -7,13 +7,10 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arguments import checked_positive, checked_type
+from ..arguments import FloatArray, checked_positive, checked_type
 from ..errors import FactorError
 from .variables import checked_values
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

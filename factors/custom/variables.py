@@ -16,12 +16,17 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arguments import as_numbers, checked_count, checked_gtsam, checked_type, described, is_whole
+from ..arguments import (
+    FloatArray,
+    as_numbers,
+    checked_count,
+    checked_gtsam,
+    checked_type,
+    described,
+    is_whole,
+)
 from ..errors import FactorError
-
-FloatArray = NDArray[np.float64]
 
 _KEYS = 2**64
 """gtsam's keys are unsigned numbers of 64 bits."""

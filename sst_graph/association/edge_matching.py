@@ -28,11 +28,7 @@ from sst_graph.factors.robust import RobustKernel
 from sst_graph.features.lidar_edges import Boundaries, Edge, joined
 from sst_graph.features.mask_contour import ContourFeet, ContourMap, nearest_contours, stretches
 from sst_graph.features.picture_gradients import EdgePlace, PictureGradients, nearest_edges
-from sst_graph.types import SemanticClass
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
+from sst_graph.types import BoolArray, FloatArray, IntArray, SemanticClass
 
 _OUTWARD, _LEAST_STRETCH = 0.01, 0.1
 """A pixel that is farther from the principal point by the first fraction must be imaged farther out by at

@@ -15,8 +15,7 @@ from scipy.spatial import cKDTree
 
 from sst_graph.factors import Alignment, CameraTwist, MotionModel, PinholeCamera
 from sst_graph.factors.motion import moved_points
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 _MOTION_MODEL: MotionModel = "translation"
 """The paper's: points move by v times the interval (:mod:`sst_graph.factors.motion`)."""

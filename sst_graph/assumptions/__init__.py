@@ -7,14 +7,10 @@ place in that order is its key in the graph and in checkpoints.
 import math
 from collections.abc import Sequence
 
-from sst_graph.assumptions.clocks import LINE_DELAY, SKEW
-from sst_graph.assumptions.distortion import K1, K2
-from sst_graph.assumptions.focal_length import FOCAL
-from sst_graph.assumptions.lidar_elevation import ELEVATION
-from sst_graph.assumptions.lidar_range import RANGE_BIAS, RANGE_SCALE
 from sst_graph.assumptions.model import Assumption, Effect, View, combined
-from sst_graph.assumptions.principal_point import CX, CY
-from sst_graph.assumptions.sweep import SWEEP
+from sst_graph.assumptions.of_camera import CX, CY, FOCAL, K1, K2
+from sst_graph.assumptions.of_lidar import ELEVATION, RANGE_BIAS, RANGE_SCALE
+from sst_graph.assumptions.of_time import LINE_DELAY, SKEW, SWEEP
 from sst_graph.errors import ConfigError
 
 ASSUMPTIONS: dict[str, Assumption] = {

@@ -16,11 +16,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.factors.camera import PinholeCamera
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.association.nearest import ClassView, match_nearest
 from sst_graph.drive.preparation import Drive, ImageFeatures, ScanFeatures
@@ -17,9 +16,7 @@ from sst_graph.factors.matches import Alignment
 from sst_graph.graph.elimination import Unknowns, marginal_covariance
 from sst_graph.graph.state import EXTRINSIC, time_offset_key
 from sst_graph.result import FrameId
-from sst_graph.types import Calibration, SemanticClass
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import Calibration, FloatArray, SemanticClass
 
 TIME_OFFSET = time_offset_key(0)
 

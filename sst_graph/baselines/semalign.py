@@ -10,15 +10,12 @@ from collections.abc import Sequence
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from sst_graph.baselines.nearest_pixel_frames import MatchFrame, frozen_covariance, step_once
 from sst_graph.baselines.sst_calib import NearestSolution, PaperProblem, still_frames
 from sst_graph.factors import PinholeCamera
-from sst_graph.types import Calibration
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import Calibration, FloatArray
 
 BOX_DEG, BOX_M = 10.0, 0.1
 """Half widths of the samples about the guess, by axis [deg], [m]: the starts of the paper's experiments."""

@@ -30,10 +30,9 @@ from sst_graph.graph.state import EXTRINSIC
 from sst_graph.odometry import metric_motions, standstill_frames
 from sst_graph.odometry.visual import DepthProvider
 from sst_graph.sampling import evenly_spread
-from sst_graph.types import Calibration, RelativeMotion, SemanticClass
+from sst_graph.types import Calibration, FloatArray, RelativeMotion, SemanticClass
 
 _LOG = logging.getLogger(__name__)
-FloatArray = NDArray[np.float64]
 
 
 _STATIC_PHASES = ((20.0, 20), (1.0, 30), (0.02, 10))

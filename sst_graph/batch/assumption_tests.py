@@ -34,8 +34,8 @@ from sst_graph.graph.linear import scaled_inverse
 from sst_graph.graph.outer_loop import JointSolution, solve_joint
 from sst_graph.graph.state import State, nuisance_key
 from sst_graph.objects.tracks import ObjectId
+from sst_graph.types import FloatArray
 
-FloatArray = NDArray[np.float64]
 _LOG = logging.getLogger(__name__)
 
 _LEAST_FREEDOM = 8

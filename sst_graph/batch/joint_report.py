@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.batch.assumption_tests import estimated_report
 from sst_graph.batch.lower_edges import WithLowerEdges
@@ -21,8 +20,7 @@ from sst_graph.inspect.frame_gains import frame_gains
 from sst_graph.inspect.frame_information import KEY as FRAME_INFORMATION
 from sst_graph.inspect.frame_information import to_document
 from sst_graph.quality.profiles import profiles
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 _FAR_SIGMAS = 6.0
 """Two estimates farther apart than this [standard deviations] contradict each other: no sampling error of a

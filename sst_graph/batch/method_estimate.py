@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.config import to_dict
@@ -30,12 +29,10 @@ from sst_graph.graph.outer_loop import JointSolution
 from sst_graph.graph.state import State
 from sst_graph.odometry.sweep import SWEEP_KEY
 from sst_graph.result import CalibrationResult, DriveOffset, FrameId, Status, WeakDirection
-from sst_graph.types import Guess
+from sst_graph.types import FloatArray, Guess
 
 if TYPE_CHECKING:
     from sst_graph.batch.problem import JointOutcome, MatchedDrives
-
-FloatArray = NDArray[np.float64]
 
 UNKNOWN_SIGMAS = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
 """(7,) deviations of what is not known at all [rad, m, s]."""

@@ -8,7 +8,6 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.contradictions import FALSE_ALARM
@@ -21,9 +20,7 @@ from sst_graph.errors import EstimationError
 from sst_graph.graph.outer_loop import KERNELS_PX, solve_joint
 from sst_graph.graph.state import EXTRINSIC, State, difference, time_offset_key
 from sst_graph.hand_eye.solution import MotionSolution, solve_motion
-from sst_graph.types import Guess
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray, Guess
 
 MAX_DISAGREEMENT_CHI2 = 40.0
 """Chi-squared, of 7, of the difference between labels and motion up to which the motion is used: both

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.covariance.contradiction import PartEstimate
@@ -17,9 +16,7 @@ from sst_graph.graph.matching import Tracks, edges_of, match_all
 from sst_graph.graph.outer_loop import JointProblem, JointSolution, robust_weights, solve_joint
 from sst_graph.graph.state import State, difference
 from sst_graph.objects.tracks import tracks_of_scans
-
-FloatArray = NDArray[np.float64]
-
+from sst_graph.types import FloatArray
 
 _MOST_AT_LAST_SCALE = 3
 """Most further outer iterations at the last kernel scale: what is left of a step then is within a sigma."""

@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import gtsam
-import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.lower_edges import WithLowerEdges, with_lower_edges
@@ -31,9 +29,7 @@ from sst_graph.initialization.selection import Selection, alternatives, select_s
 from sst_graph.objects.tracks import ObjectId, object_tracks
 from sst_graph.quality.fit_of_solution import FitOfDrives
 from sst_graph.stepwise import run_to_end
-from sst_graph.types import Guess
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray, Guess
 
 
 @dataclass(frozen=True)

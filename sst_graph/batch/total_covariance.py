@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.batch.method_estimate import DriveCovariance
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
@@ -24,8 +23,7 @@ from sst_graph.graph.frozen_problem import FrozenProblem
 from sst_graph.graph.matching import DriveMatches
 from sst_graph.graph.outer_loop import JointConfig, JointSolution
 from sst_graph.odometry.sweep import SweepTiming
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 
 @dataclass(frozen=True)

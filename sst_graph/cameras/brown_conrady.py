@@ -19,14 +19,9 @@ from functools import cached_property
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from sst_graph.cameras.model import (
-    LARGEST_COEFFICIENT,
-    BoolArray,
-    CameraModel,
-    FloatArray,
-    smallest_positive_root,
-)
+from sst_graph.cameras.model import LARGEST_COEFFICIENT, CameraModel, smallest_positive_root
 from sst_graph.errors import ConfigError, count_of
+from sst_graph.types import BoolArray, FloatArray
 
 _NAMES = {0: "pinhole", 4: "plumb_bob", 5: "plumb_bob", 8: "rational_polynomial", 12: "thin_prism"}
 _WIDEST = np.tan(np.deg2rad(89.5))

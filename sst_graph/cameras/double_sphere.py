@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sst_graph.cameras.model import BoolArray, CameraModel, FloatArray
+from sst_graph.cameras.model import CameraModel
 from sst_graph.errors import ConfigError
 from sst_graph.factors.camera import MIN_DEPTH_M
+from sst_graph.types import BoolArray, FloatArray
 
 
 @dataclass(frozen=True)

@@ -16,15 +16,10 @@ from functools import cached_property
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from sst_graph.cameras.model import (
-    LARGEST_COEFFICIENT,
-    BoolArray,
-    CameraModel,
-    FloatArray,
-    smallest_positive_root,
-)
+from sst_graph.cameras.model import LARGEST_COEFFICIENT, CameraModel, smallest_positive_root
 from sst_graph.errors import ConfigError
 from sst_graph.factors.camera import MIN_DEPTH_M
+from sst_graph.types import BoolArray, FloatArray
 
 _STEPS = 512
 """Of the table that starts Newton's method."""

@@ -14,10 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.factors.camera import PinholeCamera
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-
+from sst_graph.types import BoolArray, FloatArray
 
 LARGEST_COEFFICIENT = 1e6
 """Of a distortion; larger ones are no lens, and their powers overflow."""

@@ -12,7 +12,6 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.cameras.brown_conrady import BrownConradyCamera
 from sst_graph.cameras.double_sphere import DoubleSphereCamera
@@ -21,8 +20,8 @@ from sst_graph.cameras.model import LARGEST_COEFFICIENT, CameraModel
 from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.files.checked_values import checked_camera, checked_pose, pinhole_camera
+from sst_graph.types import FloatArray
 
-FloatArray = NDArray[np.float64]
 Table = Mapping[str, Any]
 
 _BROWN_CONRADY = {

@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.cameras.model import BoolArray, CameraModel, FloatArray
+from sst_graph.cameras.model import CameraModel
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.files.checked_values import pinhole_camera
-from sst_graph.types import CameraImage, PixelStretch, SemanticClass
+from sst_graph.types import BoolArray, CameraImage, FloatArray, PixelStretch, SemanticClass
 
 FIELD_OF_VIEW_DEG = 110.0
 """Widest default field of a rectified camera [deg]: a pinhole stretches the rim by 1 / cos^2, here by 3."""

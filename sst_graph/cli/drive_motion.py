@@ -6,13 +6,10 @@ from bisect import bisect_left
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.data.frame_parts import RecentReader, scan_positions
 from sst_graph.odometry.lidar import LidarOdometry
-from sst_graph.types import RelativeMotion
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray, RelativeMotion
 
 
 class DriveMotion:

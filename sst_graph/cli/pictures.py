@@ -21,10 +21,8 @@ from sst_graph.odometry.lidar import lidar_odometry
 from sst_graph.report.drawn_frame import DrawnFrame
 from sst_graph.result import CalibrationResult
 from sst_graph.sampling import evenly_spread
-from sst_graph.types import CameraImage, Frame, Scan, SemanticClass, Source
+from sst_graph.types import CameraImage, FloatArray, Frame, Scan, SemanticClass, Source
 from sst_graph.viz import Placement, draw_overlay, stacked
-
-FloatArray = NDArray[np.float64]
 
 
 def position_of(drive: RecentReader, index: int) -> int:

@@ -90,9 +90,21 @@ class Range:
     unit: str = ""
 
     @staticmethod
+    @functools.cache
     def of(field: dataclasses.Field[Any]) -> Range:
         """The range in the metadata of ``field``, whose keys are those of :class:`Bounds`."""
-        return _range_of(field)
+        given = field.metadata
+        unit = given.get("unit")
+        return Range(
+            low=given.get("more_than", given.get("at_least")),
+            high=given.get("less_than", given.get("at_most")),
+            open_low="more_than" in given,
+            open_high="less_than" in given,
+            length=given.get("length"),
+            order=given.get("order"),
+            choices=given.get("choices"),
+            unit=unit_of(field.name) if unit is None else unit,
+        )
 
     def holds(self, number: Any) -> bool:
         """Whether a number is within the bounds."""
@@ -108,22 +120,6 @@ class Range:
         if self.high is not None:
             parts.append(f"{'less than' if self.open_high else 'at most'} {self.high:.10g}")
         return f"{' and '.join(parts)} {self.unit}".strip() if parts else ""
-
-
-@functools.cache
-def _range_of(field: dataclasses.Field[Any]) -> Range:
-    given = field.metadata
-    unit = given.get("unit")
-    return Range(
-        low=given.get("more_than", given.get("at_least")),
-        high=given.get("less_than", given.get("at_most")),
-        open_low="more_than" in given,
-        open_high="less_than" in given,
-        length=given.get("length"),
-        order=given.get("order"),
-        choices=given.get("choices"),
-        unit=unit_of(field.name) if unit is None else unit,
-    )
 
 
 def unit_of(name: str) -> str:

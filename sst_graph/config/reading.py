@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from sst_graph.config.old_names import with_new_names
+from sst_graph.config.old_names import fixed_in, with_new_names
 from sst_graph.config.ranges import Range
 from sst_graph.config.settings import join, settings_fields
 from sst_graph.config.values import checked, printable, shown
@@ -24,7 +24,7 @@ def from_dict(cls: type[T], data: Mapping[str, Any], base: T | None = None) -> T
     """A ``cls`` with the values of ``data``; what is not named is as in ``base``, or keeps its default, in
     nested tables too.
 
-    Old names of settings (:mod:`sst_graph.config.renamed`) are accepted with a warning in the log.
+    Old names of settings (:mod:`sst_graph.config.old_names`) are accepted with a warning in the log.
 
     Raises:
         ConfigError: an unknown key, a value of a wrong type or out of its range, a missing key.
@@ -154,8 +154,13 @@ def _first_below(place: str, value: Any) -> str:
 
 
 def _hint(root: Any, name: str) -> str:
-    """The settings of ``root`` that an unknown dotted name may mean, else the names at the top."""
+    """The settings of ``root`` that an unknown dotted name may mean, else the names at the top; or what fixes
+    it, where it was a setting and its table has none that is spelled alike.
+    """
     near = _nearest(name, _all_names(root)) if len(name) <= 200 else []
+    table = name.rpartition(".")[0]
+    if fixed_in(name) and not (table and any(known.rpartition(".")[0] == table for known in near)):
+        return f"it is fixed in {fixed_in(name)}, leave it out"
     if near:
         return "did you mean " + " or ".join(f"'{known}'" for known in near) + "?"
     top = ", ".join(sorted(field.name for field, _ in settings_fields(root)))

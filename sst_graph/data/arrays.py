@@ -61,6 +61,11 @@ def numbered_files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
     return dict(sorted(files.items()))
 
 
+def optional_files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
+    """As :func:`numbered_files`, of a folder that need not be there."""
+    return numbered_files(folder, suffixes) if folder.is_dir() else {}
+
+
 def read_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Points (n, 3) float32 [m] and reflectances (n,) of a KITTI cloud: :func:`float_columns`.
 

@@ -8,11 +8,14 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Literal, TypedDict, Unpack, get_args
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.factors.arguments import described, is_whole
 from sst_graph.files.reading import path_of
 from sst_graph.files.typed_values import wrong_fields
-from sst_graph.sweep_timing import SweepStamp
+from sst_graph.sweep_timing import SweepStamp, SweepTiming
 from sst_graph.types import Source
 
 Sweep = Literal["auto", "compensated", "clockwise", "counterclockwise", "instant", "azimuth"]
@@ -108,6 +111,20 @@ class SourceOptions:
             )
         if self.frames is not None:
             _check_frames(self.frames)
+
+    def timing(self, stamps_ns: NDArray[np.int64]) -> SweepTiming | None:
+        """Times of points by azimuth, where a sense of rotation is named; stamps_ns: (n,) of the scans.
+
+        Raises:
+            ConfigError: a single scan, which tells no period.
+        """
+        if self.sweep not in TURNS:
+            return None
+        if len(stamps_ns) < 2:
+            raise ConfigError(f"sweep {self.sweep!r}: the period of a turn needs two scans or more")
+        period_s = float(np.median(np.diff(stamps_ns))) * 1e-9
+        start_rad = float(np.radians(self.sweep_start_deg))
+        return SweepTiming(TURNS[self.sweep], start_rad, period_s, self.sweep_stamp)
 
 
 BAG_OPTIONS = ("image_topic", "cloud_topic", "info_topic", "mask_topic", "stamps")

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from sst_graph.diagnosis.finding import Finding
 from sst_graph.drive.preparation import Drive
 from sst_graph.timestamps import FAR_APART_S, NS_PER_S, apart_s
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 _LONGEST_PERIOD_S, _SHORTEST_PERIOD_S = 5.0, 1.0 / 60.0
 """Scans come 5 to 30 times a second, subsampled ones every few seconds [s]."""

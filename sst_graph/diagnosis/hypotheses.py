@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.diagnosis.finding import Finding
 from sst_graph.diagnosis.fit import (
@@ -27,9 +26,7 @@ from sst_graph.diagnosis.fit import (
 from sst_graph.diagnosis.poses import start_finding
 from sst_graph.drive.preparation import Drive, ScanFeatures
 from sst_graph.errors import count_of
-from sst_graph.types import Guess
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray, Guess
 
 
 @dataclass(frozen=True)

@@ -8,14 +8,12 @@ from itertools import product
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from sst_graph.diagnosis.finding import Finding
 from sst_graph.diagnosis.fit import Fit
 from sst_graph.metrics import quaternion_angle_deg
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 _SEQUENCES = ("xyz", "zyx", "XYZ", "ZYX", "yxz", "YXZ", "zxy", "ZXY")
 """Orders in which roll, pitch and yaw are applied."""

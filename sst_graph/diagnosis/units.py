@@ -6,14 +6,12 @@ from collections.abc import Sequence
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.diagnosis.finding import Finding
 from sst_graph.drive.input_statistics import Ground, InputStatistics
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import count_of
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 _CAR_HEIGHT_M, _HIGHEST_CAR_M, _HIGHEST_VEHICLE_M = 1.5, 3.0, 4.4
 """Most vehicles are cars; trucks and buses are 4.3 m high at most. The median of drives among trucks is above

@@ -17,9 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sst_graph.features.mask_shift import ContourProfile, contour_profiles
-from sst_graph.types import CameraImage, Frame, Scan, SemanticClass
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import CameraImage, FloatArray, Frame, Scan, SemanticClass
 
 _SCANS, _IMAGES = 12, 12
 """Scans and images with the expensive statistics (geometry, contours), spread over the drive."""

@@ -9,10 +9,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.types import RelativeMotion
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from sst_graph.types import FloatArray, IntArray, RelativeMotion
 
 _REACH = 2
 """Poses to either side of one that determine the twist there."""

@@ -7,14 +7,10 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.odometry.smoothing import MotionSmoother
 from sst_graph.odometry.standstill import ZeroVelocityUpdate
-from sst_graph.types import RelativeMotion
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from sst_graph.types import FloatArray, IntArray, RelativeMotion
 
 
 @dataclass(frozen=True)

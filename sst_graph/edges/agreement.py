@@ -24,9 +24,8 @@ from sst_graph.features.picture_gradients import (
 )
 from sst_graph.graph.matching import DriveEdges
 from sst_graph.graph.state import State
+from sst_graph.types import FloatArray, IntArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 FloatMap = NDArray[np.float32]
 
 _NEAR_M = 0.5

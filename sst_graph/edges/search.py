@@ -18,8 +18,8 @@ from sst_graph.graph.matching import DriveEdges
 from sst_graph.graph.state import State
 from sst_graph.metrics import quaternion_angle_deg
 from sst_graph.stepwise import Stepwise
+from sst_graph.types import FloatArray
 
-FloatArray = NDArray[np.float64]
 FloatMap = NDArray[np.float32]
 
 _STAGES = ((14.0, 1.0, 100), (8.0, 0.5, 40), (6.0, 0.25, 30))

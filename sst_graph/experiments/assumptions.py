@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drives
@@ -17,8 +16,7 @@ from sst_graph.errors import ConfigError, count_of
 from sst_graph.experiments.starts import error_of
 from sst_graph.experiments.wrong_drives import WRONG, with_line_delay
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 SIZES: dict[str, tuple[float, ...]] = {
     "focal": (0.003, 0.01, 0.02, 0.04, 0.08),

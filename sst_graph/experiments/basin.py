@@ -7,7 +7,7 @@ result is far from the truth; it has failed silently where its status is ``ok`` 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import gtsam
@@ -130,13 +130,17 @@ def run(config: BasinConfig, progress: Progress | None = None) -> str:
     # Neither how many streets nor how many processes there are changes what is found on one of them.
     own = dataclasses.replace(config, streets=1, data=(), jobs=1, records="")
     places = config.data or ("",) * config.streets
-    tasks = [Task(place, number, own) for number, place in enumerate(places)]
-    found = rows_of(Work(runs_of, BasinRun, config.jobs, config.records), tasks, progress)
-    return markdown(config, [row for rows in found for row in rows])
+    drives = [[Task(place, number, own)] for number, place in enumerate(places)]
+    return markdown(config, rows_of(Work(runs_of, BasinRun, config.jobs, config.records), drives, progress))
 
 
-def runs_of(task: Task) -> list[BasinRun]:
-    """Every start of every search on one street or drive.
+def runs_of(tasks: Sequence[Task]) -> Iterator[list[BasinRun]]:
+    """Every start of every search on each street or drive."""
+    yield from map(_runs_of_drive, tasks)
+
+
+def _runs_of_drive(task: Task) -> list[BasinRun]:
+    """Every start of every search on one.
 
     Raises:
         DataError: the drive cannot be used.

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drives
 from sst_graph.config import Settings, setting
@@ -15,8 +14,7 @@ from sst_graph.drive.preparation import Progress
 from sst_graph.errors import ConfigError
 from sst_graph.experiments.starts import error_of, start_near
 from sst_graph.simulator import SimulationConfig, simulate
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 DRIVES: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "standing": ("standing, 3 frames", {"motion": "standing", "frames": 3, "time_offset_s": 0.0}),
@@ -118,7 +116,6 @@ _HEADER = (
     "| drive | runs (not converged, wrong) | NEES / dimension: rotation | translation | time offset | all "
     "| within 95 % intervals: rotation, translation, time offset |"
 )
-
 
 _PARTS = {"rotation": slice(0, 3), "translation": slice(3, 6), "time offset": slice(6, 7), "all": slice(0, 7)}
 

@@ -1,30 +1,33 @@
-"""Tasks of an experiment in processes of their own, resumable: what is done stands in a file of records."""
+"""Tasks of an experiment, resumable: what is done stands in a file of records."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import multiprocessing
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Generic, TextIO, TypeVar
+from typing import Any, Generic, TypeVar
 
 from sst_graph.drive.preparation import Progress
-from sst_graph.errors import ConfigError, DataError, EstimationError
-from sst_graph.files.reading import FileKind, parse_json, read_text
+from sst_graph.errors import ConfigError, DataError
+from sst_graph.experiments.processes import Run, run_groups
+from sst_graph.files.reading import FileKind, parse_json, read_file
 from sst_graph.files.staging import lock_file
 from sst_graph.files.strict_json import json_able
 from sst_graph.files.typed_values import wrong_fields
 
 RECORDS = FileKind("records of an experiment", 256 * 1024 * 1024)
-_HEADER = '{"format": "sst-graph/experiment-records", "version": 1}'
+_HEADER = b'{"format": "sst-graph/experiment-records", "version": 1}\n'
 
 T = TypeVar("T")
 R = TypeVar("R")
+
+
+def digest(task: object) -> str:
+    """A task by its content: other settings make other keys."""
+    return hashlib.sha256(json.dumps(json_able(task), sort_keys=True).encode()).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -32,98 +35,82 @@ class Work(Generic[T, R]):
     """What is done with each task.
 
     Attributes:
-        run: a function of a module, of one task; its results are rows.
+        run: yields the rows of each of the tasks that it is given; a function of a module, or a partial.
         row: dataclass of a row, whose fields are plain values.
         jobs: processes at a time.
         records: file of what is done, which a further call goes on from; "": none.
+        key: by which a task is known there.
     """
 
-    run: Callable[[T], list[R]]
+    run: Run[T, list[R]]
     row: type[R]
     jobs: int = 1
     records: str = ""
+    key: Callable[[T], str] = digest
 
 
-def rows_of(work: Work[T, R], tasks: Sequence[T], progress: Progress | None = None) -> list[list[R]]:
-    """The rows of every task, in the order of the tasks.
+def rows_of(work: Work[T, R], groups: Sequence[Sequence[T]], progress: Progress | None = None) -> list[R]:
+    """The rows of every task, in the order of the tasks; those of a group share what ``work.run`` prepares.
 
     Raises:
         ConfigError: the file of records is of another kind, or cannot be written.
         DataError: what it holds cannot be used, or a task raises it.
         EstimationError: a process died.
     """
-    keys = [_key(task) for task in tasks]
-    done = _read(work) if work.records else {}
-    missing = [number for number, key in enumerate(keys) if key not in done]
-    if progress is not None:
-        progress("tasks", len(tasks) - len(missing), len(tasks))
-    with ExitStack() as stack:
-        file = stack.enter_context(_appending(work.records)) if work.records and missing else None
-        for finished, (number, rows) in enumerate(_run(work, tasks, missing), start=1):
-            done[keys[number]] = rows
-            if file is not None:
-                line = {"task": keys[number], "rows": [json_able(row) for row in rows]}
-                file.write(json.dumps(line) + "\n")
-                file.flush()
+    keys = [work.key(task) for group in groups for task in group]
+    with _records(work) as (done, keep):
+        left = [[task for task in group if work.key(task) not in done] for group in groups]
+        finished = len(keys) - sum(map(len, left))
+        if progress is not None:
+            progress("runs", finished, len(keys))
+        for task, rows in run_groups(work.run, [group for group in left if group], work.jobs):
+            keep(work.key(task), rows)
+            finished += 1
             if progress is not None:
-                progress("tasks", len(tasks) - len(missing) + finished, len(tasks))
-    return [done[key] for key in keys]
-
-
-def _run(work: Work[T, R], tasks: Sequence[T], numbers: Sequence[int]) -> Iterator[tuple[int, list[R]]]:
-    """(number, rows) of some tasks, as they are done."""
-    if work.jobs == 1 or len(numbers) < 2:
-        yield from ((number, work.run(tasks[number])) for number in numbers)
-        return
-    # Spawned: a forked process would share gtsam's and OpenCV's threads and locks.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(work.jobs, len(numbers)), context) as pool:
-        waiting: dict[Future[list[R]], int] = {pool.submit(work.run, tasks[n]): n for n in numbers}
-        try:
-            for future in as_completed(waiting):
-                yield waiting[future], future.result()
-        except BrokenProcessPool as error:
-            raise EstimationError("a process of the experiment died; run it again to go on") from error
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
-
-
-def _key(task: object) -> str:
-    """A task by its content: other settings make other keys."""
-    return hashlib.sha256(json.dumps(json_able(task), sort_keys=True).encode()).hexdigest()
+                progress("runs", finished, len(keys))
+    return [row for key in keys for row in done[key]]
 
 
 @contextmanager
-def _appending(path: str) -> Iterator[TextIO]:
+def _records(work: Work[T, R]) -> Iterator[tuple[dict[str, list[R]], Callable[[str, list[R]], None]]]:
+    """Rows by key, and what adds some, on the disk before it returns. What a kill cut off is removed."""
+    done: dict[str, list[R]] = {}
+    if not work.records:
+        yield done, done.__setitem__
+        return
     try:
-        with open(path, "a", encoding="utf-8") as file:
-            if not lock_file(file.fileno()):
-                raise ConfigError(f"{path}: another run is writing it, expected to be the only one")
-            # A killed run may have left its last line unfinished.
-            file.write("\n" if file.tell() else _HEADER + "\n")
-            yield file
+        file = open(work.records, "ab", buffering=0)  # noqa: SIM115 (closed below)
     except OSError as error:
-        raise ConfigError(f"{path}: records cannot be written ({error.strerror})") from error
+        raise ConfigError(f"{work.records}: records cannot be written ({error.strerror})") from error
+
+    def keep(key: str, rows: list[R]) -> None:
+        done[key] = rows
+        write(json.dumps({"task": key, "rows": [json_able(row) for row in rows]}).encode() + b"\n")
+
+    def write(line: bytes) -> None:
+        file.write(line)
+        os.fsync(file.fileno())
+
+    with file:
+        if not lock_file(file.fileno()):
+            raise ConfigError(f"{work.records}: another run is writing it, expected to be the only one")
+        content = read_file(work.records, RECORDS)
+        whole = content[: content.rfind(b"\n") + 1]
+        if not (whole.startswith(_HEADER) or _HEADER.startswith(content)):
+            raise ConfigError(f"{work.records}: found another kind of file, expected {RECORDS.name}")
+        for number, line in enumerate(whole.decode(errors="replace").splitlines()[1:], start=2):
+            done.update(_record(line, work.row, f"{work.records}, line {number}"))
+        file.truncate(len(whole))
+        if not whole:
+            write(_HEADER)
+        yield done, keep
 
 
-def _read(work: Work[T, R]) -> dict[str, list[R]]:
-    """Rows by key; a line that a killed run left unfinished is passed over."""
-    if not Path(work.records).exists():
-        return {}
-    lines = read_text(work.records, RECORDS).splitlines()
-    if lines and lines[0] != _HEADER:
-        raise ConfigError(f"{work.records}: found another kind of file, expected {RECORDS.name}")
-    done = {}
-    for number, line in enumerate(lines[1:], start=2):
-        place = f"{work.records}, line {number}"
-        try:
-            content = parse_json(line, place)
-        except DataError:
-            continue
-        if not isinstance(content, Mapping) or not isinstance(content.get("rows"), list):
-            raise DataError(place, "no rows", "a task with its rows")
-        done[str(content.get("task"))] = [_row(work.row, row, place) for row in content["rows"]]
-    return done
+def _record(line: str, row: type[R], place: str) -> dict[str, list[R]]:
+    content = parse_json(line, place)
+    if not isinstance(content, Mapping) or not isinstance(content.get("rows"), list):
+        raise DataError(place, "no rows", "a task with its rows")
+    return {str(content.get("task")): [_row(row, values, place) for values in content["rows"]]}
 
 
 def _row(cls: type[R], values: Any, place: str) -> R:

@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.batch import CalibrationConfig
 from sst_graph.config import Settings, setting
@@ -22,9 +21,7 @@ from sst_graph.rig.known import KnownPose, KnownRig
 from sst_graph.rig.marginal import RigMarginal
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
 from sst_graph.simulator.rig import beside, stereo_pose, surround, with_mounts
-from sst_graph.types import GroundTruth, Guess
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray, GroundTruth, Guess
 
 STREET: Mapping[str, Any] = {
     "motion": "stop_and_go",

@@ -15,7 +15,6 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.batch import CalibrationConfig, calibrate_prepared
 from sst_graph.config import Settings, setting
@@ -32,8 +31,6 @@ from sst_graph.experiments.slam_graph import (
 from sst_graph.odometry import RegisteredScan, loop_closures, scan_to_scan
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
 from sst_graph.types import Calibration
-
-FloatArray = NDArray[np.float64]
 
 WEATHERS: Mapping[str, Mapping[str, Any]] = {
     "fog": {"max_range_m": 20.0, "range_noise_m": 0.08, "drop_out": 0.5},

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.association.edge_matching import MatchConfig
 from sst_graph.config import Settings, setting
@@ -26,9 +25,7 @@ from sst_graph.factors import (
 from sst_graph.objects.tracks import ObjectId, object_tracks
 from sst_graph.odometry import LoopClosure, metric_motions
 from sst_graph.slam.align import CameraCalibration, FrameMatching, ScanMotion, align_frame
-from sst_graph.types import Calibration, RelativeMotion, SemanticClass
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import Calibration, FloatArray, RelativeMotion, SemanticClass
 
 EXTRINSIC, TIME_OFFSET, BIAS = (int(gtsam.symbol(letter, 0)) for letter in "EDB")
 """Keys of the extrinsic, the time offset and the vehicles' common mask bias."""

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.batch import CalibrationConfig, calibrate
 from sst_graph.config import Settings, setting
@@ -16,8 +15,7 @@ from sst_graph.drive.preparation import Progress
 from sst_graph.errors import ConfigError
 from sst_graph.metrics import CalibrationErrors, calibration_errors
 from sst_graph.result import CalibrationResult
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 PARTS = (slice(0, 3), slice(3, 6), slice(6, 7))
 """Rotation, translation and time offset among the seven unknowns."""

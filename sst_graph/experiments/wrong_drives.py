@@ -17,8 +17,6 @@ from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.simulator import SimulatedDrive
 from sst_graph.types import CameraImage, Scan, SemanticClass
 
-FloatArray = NDArray[np.float64]
-
 
 def with_focal(drive: KeptDrive, size: float) -> KeptDrive:
     """The camera's true focal length is larger by the share ``size`` than the one given."""

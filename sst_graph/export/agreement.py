@@ -6,15 +6,13 @@ from collections.abc import Sequence
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from sst_graph.covariance.contradiction import Difference, PartEstimate, combined, name_step
 from sst_graph.errors import ContradictionError, EstimationError, count_of
 from sst_graph.graph.linear import unit_scale
 from sst_graph.marginal import CalibrationMarginal, Separated
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 SIGNIFICANCE = 1e-3
 """Probability that marginals which agree, with covariances that hold, are refused."""

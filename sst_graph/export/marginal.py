@@ -14,7 +14,6 @@ from collections.abc import Sequence
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.errors import EstimationError, count_of
 from sst_graph.export.agreement import SIGNIFICANCE, check_agreement, check_apart
@@ -38,7 +37,7 @@ from sst_graph.marginal import (
 from sst_graph.marginal import carried as _carried
 from sst_graph.marginal import inverse as _inverse
 from sst_graph.result import CalibrationResult
-from sst_graph.types import Calibration
+from sst_graph.types import Calibration, FloatArray
 from sst_graph.validation import checked_guess
 
 __all__ = [
@@ -55,8 +54,6 @@ __all__ = [
     "marginal_of_result",
     "read_marginal",
 ]
-
-FloatArray = NDArray[np.float64]
 
 
 def marginal_of_result(result: CalibrationResult) -> CalibrationMarginal:

@@ -11,7 +11,6 @@ from typing import Any
 import cv2
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.errors import ConfigError
 from sst_graph.export.frames import OPTICAL_AXES, Rig
@@ -19,8 +18,6 @@ from sst_graph.export.marginal import marginal_of_result
 from sst_graph.export.text import heading, row
 from sst_graph.imports.rotations import quaternion_xyzw
 from sst_graph.result import CalibrationResult
-
-FloatArray = NDArray[np.float64]
 
 
 def kitti(rig: Rig) -> str:

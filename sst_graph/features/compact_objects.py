@@ -16,9 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from sst_graph.features.ground import heights_above_ground, on_ground
 from sst_graph.features.lidar_beams import Beams, arrange_beams
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from sst_graph.types import FloatArray, IntArray
 
 _APART_M = 0.4
 """Neighbours along a ring at least this far apart are separate ..."""

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 _CELL_M = 2.0
 """Edge of the plan's cells [m]."""

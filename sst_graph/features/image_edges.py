@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from sst_graph.features.sampling import sampled
+from sst_graph.types import FloatArray
 
-FloatArray = NDArray[np.float64]
 FloatMap = NDArray[np.float32]
 Picture = NDArray[np.uint8]
 

@@ -18,11 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.features.lidar_beams import Beams, arrange_beams
-from sst_graph.types import Scan, SemanticClass
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
-
+from sst_graph.types import FloatArray, IntArray, Scan, SemanticClass
 
 _BEHIND_M = 0.5
 """The neighbour has to be farther by this much: less is the object's own relief [m]."""

@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 from sst_graph.features.image_edges import Picture, PictureEdges, find_picture_edges
 from sst_graph.features.sampling import sampled
 from sst_graph.files.array_store import ArrayStore, shape_of, storable
-from sst_graph.types import PixelStretch, SemanticClass
+from sst_graph.types import FloatArray, IntArray, PixelStretch, SemanticClass
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 FloatMap = NDArray[np.float32]
 
 _SMOOTHING_PX = 1.0

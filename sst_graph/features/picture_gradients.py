@@ -19,8 +19,8 @@ from sst_graph.features.image_edges import Picture
 from sst_graph.features.mask_contour import ContourFeet, well_inside
 from sst_graph.features.sampling import sampled
 from sst_graph.files.array_store import ArrayStore, shape_of, storable
+from sst_graph.types import FloatArray
 
-FloatArray = NDArray[np.float64]
 FloatMap = NDArray[np.float32]
 
 EdgePlace = Literal["centre", "peak", "strongest"]

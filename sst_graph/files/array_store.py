@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import logging
 import math
-import mmap
 import os
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from io import FileIO
 from typing import Any, TypeVar
@@ -96,39 +96,14 @@ class ArrayStore:
             OSError: it cannot be read.
         """
         assert self._file is not None
-        if (mapped := _mapped(self._file.fileno(), start, dtype, shape)) is not None:
-            return mapped
-        flat = np.empty(math.prod(shape), dtype)
-        view, got = flat.view(np.uint8).data, 0
-        while got < len(view):
-            if not (count := _read_at(self._file.fileno(), view[got:], start + got)):
-                raise OSError(f"the temporary file of a drive ends {count_of(len(view) - got, 'byte')} early")
-            got += count
-        return flat.reshape(shape)
-
-
-def _mapped(descriptor: int, start: int, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any] | None:
-    """A large array of a file, of which only what is looked at is read; None of a small one, or where the
-    file cannot be mapped."""
-    count = math.prod(shape)
-    if count * dtype.itemsize < _MAPPED_BYTES:
-        return None
-    before = start % mmap.ALLOCATIONGRANULARITY
-    length = before + count * dtype.itemsize
-    try:
-        view = mmap.mmap(descriptor, length, access=mmap.ACCESS_READ, offset=start - before)
-    except (OSError, ValueError):
-        return None
-    return np.frombuffer(view, dtype, count, before).reshape(shape)
-
-
-def _read_at(descriptor: int, view: memoryview, start: int) -> int:
-    """Read into a view; number of bytes. The file's own position stays, for forked processes share it."""
-    if hasattr(os, "preadv"):
-        return os.preadv(descriptor, [view], start)
-    data = os.pread(descriptor, len(view), start)  # macOS
-    view[: len(data)] = data
-    return len(data)
+        size = math.prod(shape) * dtype.itemsize
+        if size >= _MAPPED_BYTES:
+            with suppress(OSError, ValueError):  # of a file that cannot be mapped
+                return np.memmap(self._file, dtype, "r", start, shape).view(np.ndarray)
+        data = os.pread(self._file.fileno(), size, start)
+        if len(data) < size:
+            raise OSError(f"the temporary file of a drive ends {count_of(size - len(data), 'byte')} early")
+        return np.frombuffer(bytearray(data), dtype).reshape(shape)
 
 
 class StoredArray:

@@ -11,13 +11,11 @@ from typing import Any, TypeGuard
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
 from sst_graph.factors.arguments import described
 from sst_graph.factors.camera import PinholeCamera
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 ROTATION_TOLERANCE = 1e-3
 """Largest entry of R R' - I that is put down to rounding in a file."""
@@ -75,16 +73,6 @@ def checked_pose(matrix: FloatArray, place: str) -> gtsam.Pose3:
 def is_number(value: Any) -> TypeGuard[float]:
     """Whether a value from a file is a number of a size that standard deviations have."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MAX_SIGMA
-
-
-def put_line(lines: dict[str, FloatArray], name: str, values: FloatArray, place: str) -> None:
-    """Keep a named line's values.
-
-    Raises:
-        DataError: an earlier line of this name has others.
-    """
-    if not np.array_equal(lines.setdefault(name, values), values):
-        raise DataError(place, f"another {name} than above", f"one line {name}")
 
 
 def read_only(values: FloatArray) -> FloatArray:

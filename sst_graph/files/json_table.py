@@ -10,12 +10,10 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.errors import DataError, printable
 from sst_graph.files.checked_values import check_finite, checked_pose, checked_text, checked_time_offset_s
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 MAX_SENTENCE = 4000
 """Characters of a sentence that is kept."""

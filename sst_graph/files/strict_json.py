@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import gtsam
 import numpy as np
 
 _LONE_SURROGATE = re.compile("[\ud800-\udfff]")
@@ -25,11 +26,13 @@ def strict_json(document: Mapping[str, Any]) -> str:
 
 
 def json_able(value: Any) -> Any:
-    """``value`` with arrays and tuples as lists, enums as names, and None for what is not finite."""
+    """``value`` with arrays, poses and tuples as lists, enums as names, and None for what is not finite."""
     if isinstance(value, Mapping):
         return {str(key): json_able(item) for key, item in value.items()}
     if isinstance(value, np.ndarray):
         return json_able(value.tolist())
+    if isinstance(value, gtsam.Pose3):
+        return json_able(value.matrix())
     if isinstance(value, (list, tuple)):
         return [json_able(item) for item in value]
     if isinstance(value, enum.Enum):

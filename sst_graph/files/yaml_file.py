@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from sst_graph.errors import DataError, MissingDependencyError, count_of, one_line
+from sst_graph.errors import DataError, count_of, one_line, optional_module
 from sst_graph.files.reading import FileKind, read_text
 
 YAML = FileKind("a YAML file", 64 * 1024)
@@ -27,12 +27,9 @@ def parse_yaml(text: str, place: str | Path) -> dict[str, Any]:
         DataError: no YAML, anchors and aliases, tags of objects, deep nesting, a name twice, no table.
         MissingDependencyError: PyYAML is not installed.
     """
-    try:
-        import yaml
-    except ImportError:
-        raise MissingDependencyError(
-            f"{place}: reading YAML needs PyYAML, which is not installed: pip install 'sst-graph[yaml]'"
-        ) from None
+    without = f"{place}: reading YAML needs PyYAML, which is not installed"
+    optional_module("yaml", without, "yaml")
+    import yaml
 
     if text.startswith("%YAML:"):  # OpenCV's first line is no directive of YAML
         text = text.partition("\n")[2]

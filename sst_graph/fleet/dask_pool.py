@@ -17,7 +17,7 @@ from contextlib import ExitStack, contextmanager
 from itertools import islice
 from typing import Any
 
-from sst_graph.errors import ConfigError, MissingDependencyError, count_of, one_line
+from sst_graph.errors import ConfigError, count_of, one_line, optional_module
 from sst_graph.fleet.attempt import Job
 from sst_graph.fleet.record import Record
 
@@ -47,7 +47,7 @@ def run_on_dask(
         ConfigError: no scheduler answers, or it is lost.
         MissingDependencyError: dask.distributed is not installed.
     """
-    distributed = _distributed()
+    distributed = optional_module("distributed", "--dask needs dask.distributed", "dask")
     with _client(distributed, address, workers) as client:
         waiting = iter(jobs)
         running: dict[Any, Job] = {}
@@ -169,13 +169,3 @@ class _Renewal:
             self._cluster.scale(0)
             self._cluster.scale(self._workers)
             self._last_seen = now
-
-
-def _distributed() -> Any:
-    try:
-        import distributed
-    except ImportError as error:
-        raise MissingDependencyError(
-            "--dask needs dask.distributed: pip install 'sst-graph[dask]'"
-        ) from error
-    return distributed

@@ -8,7 +8,6 @@ from typing import Any, Literal, get_args
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.errors import DataError, printable
 from sst_graph.export import common_errors
@@ -18,8 +17,7 @@ from sst_graph.files.strict_json import strict_json
 from sst_graph.inspect.reasons import short_reasons
 from sst_graph.marginal import SCAN_HASHES, CalibrationMarginal, Common, hashes_in, inverse, steps_in
 from sst_graph.result import CalibrationResult
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 FORMAT = "sst-graph/batch-record"
 VERSION = 2

@@ -9,15 +9,12 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.graph.building import tracked_objects
 from sst_graph.graph.linear import scale_of, with_ridge
 from sst_graph.graph.matching import PairMatches
 from sst_graph.graph.state import EXTRINSIC, State, bias_key, nuisance_key, object_bias_key, time_offset_key
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from sst_graph.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True)

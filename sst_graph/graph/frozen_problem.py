@@ -16,7 +16,6 @@ from functools import cached_property
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.assumptions import named_sigmas
 from sst_graph.drive.twists import camera_covariances
@@ -36,10 +35,7 @@ from sst_graph.graph.state import (
     time_offset_key,
     twist_key,
 )
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
+from sst_graph.types import BoolArray, FloatArray, IntArray
 
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-6, 1e-12, 1e5
 """Damping of the Levenberg-Marquardt steps: of the first, least, most."""

@@ -10,10 +10,8 @@ from collections.abc import Sequence
 from itertools import groupby
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from sst_graph.types import FloatArray, IntArray
 
 _LEAST_DIAGONAL = 1e-300
 """Replaces a diagonal entry of 0, so that its square root can be divided by."""

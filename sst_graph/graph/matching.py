@@ -45,10 +45,8 @@ from sst_graph.objects.dynamic_objects import (
     find_dynamic_objects,
 )
 from sst_graph.objects.tracks import ObjectId, numbers_in, of_each, tracks_of_scans
-from sst_graph.types import SemanticClass
+from sst_graph.types import FloatArray, IntArray, SemanticClass
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 DynamicObjects = dict[tuple[SemanticClass, int], DynamicObject]
 """The dynamic objects of one scan, by class and number within the scan."""
 

@@ -7,16 +7,13 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.assumptions import ASSUMPTIONS, Effect, combined
 from sst_graph.assumptions.model import Scene
 from sst_graph.drive.twists import TwistSamples
 from sst_graph.factors.alignment import Alignment, residuals
 from sst_graph.factors.motion import CameraTwist, moved_points
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from sst_graph.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True)

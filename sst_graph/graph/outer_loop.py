@@ -15,7 +15,6 @@ from itertools import pairwise
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.config import Settings, internal
 from sst_graph.drive.preparation import Drive, Progress
@@ -29,9 +28,8 @@ from sst_graph.graph.matching import DriveMatches, GraphConfig, PairMatches, Tra
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.stepwise import Stepwise, run_to_end
-from sst_graph.types import SemanticClass
+from sst_graph.types import FloatArray, SemanticClass
 
-FloatArray = NDArray[np.float64]
 _LOG = logging.getLogger(__name__)
 
 STEP_SIGMAS = 0.1

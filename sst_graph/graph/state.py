@@ -8,12 +8,9 @@ from typing import TypeVar
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.assumptions import ASSUMPTIONS
-from sst_graph.types import SemanticClass
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray, SemanticClass
 
 EXTRINSIC = gtsam.symbol("E", 0)
 """Key of the extrinsic cTl (Pose3)."""

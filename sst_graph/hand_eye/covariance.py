@@ -21,9 +21,7 @@ from numpy.typing import NDArray
 from sst_graph.graph.linear import unit_scale, with_ridge
 from sst_graph.graph.state import State
 from sst_graph.hand_eye.graph import PRIOR_SIGMAS, CameraStep, HandEyeTerms
-
-FloatArray = NDArray[np.float64]
-
+from sst_graph.types import FloatArray
 
 NOISE_INFORMATION_MARGIN = 2.0
 """Factor on the spurious information by noise, whose size is estimated from the same few motions."""

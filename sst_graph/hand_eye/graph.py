@@ -12,7 +12,6 @@ from functools import cached_property
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.drive.path import PathSteps, SensorPath
 from sst_graph.drive.preparation import Drive
@@ -29,8 +28,7 @@ from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
 from sst_graph.hand_eye.residuals import MotionResiduals, residuals_factor
 from sst_graph.odometry.relative import DirectionMotion
 from sst_graph.odometry.standstill import zero_velocity_update
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 MIN_LENGTH_M = 0.1
 """Shorter motions of the camera do not determine a direction [m]."""

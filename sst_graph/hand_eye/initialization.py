@@ -7,13 +7,10 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.drive.path import SensorPath
 from sst_graph.hand_eye.graph import CameraStep, MotionPairs, pair_motions
-from sst_graph.types import Guess
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray, Guess
 
 LEAST_SHARE = 0.4
 """A time offset for which a smaller share of the pairs has LiDAR motion is not tried."""

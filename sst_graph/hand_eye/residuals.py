@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from sst_graph.factors import Vector
 from sst_graph.factors.custom.factor import custom_factor
 from sst_graph.factors.hand_eye import LOW_TRANSLATION_M
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.drive.path import SensorPath
 from sst_graph.drive.preparation import Drive, Progress
@@ -34,10 +33,9 @@ from sst_graph.hand_eye.graph import (
     state_values,
 )
 from sst_graph.hand_eye.initialization import LEAST_SHARE, MAX_OFFSET_S, motion_starts
-from sst_graph.types import Guess
+from sst_graph.types import FloatArray, Guess
 
 _LOG = logging.getLogger(__name__)
-FloatArray = NDArray[np.float64]
 
 VAGUE_DEG, VAGUE_S = 5.0, 0.03
 """A rotation or a time offset with a larger sigma than this is as good as unknown [deg], [s]."""

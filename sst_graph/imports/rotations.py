@@ -8,13 +8,11 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.data.nuscenes.tables import pose_of
 from sst_graph.files.checked_values import checked_pose
 from sst_graph.metrics import FORWARD_R_OPTICAL
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 LINK_FROM_OPTICAL = gtsam.Pose3(FORWARD_R_OPTICAL, np.zeros(3))
 """Camera link (x forward, y left, z up) from the optical frame (x right, y down, z forward): REP 103."""

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.association.time_pairing import pair_by_time
 from sst_graph.drive.preparation import Drive
@@ -28,9 +27,7 @@ from sst_graph.initialization.global_search import (
 from sst_graph.initialization.label_agreement import LabelledPoints, SearchFrame, States
 from sst_graph.sampling import evenly_spread
 from sst_graph.stepwise import Stepwise
-from sst_graph.types import Guess, SemanticClass
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray, Guess, SemanticClass
 
 _LOG = logging.getLogger(__name__)
 

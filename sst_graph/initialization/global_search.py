@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.config import Settings, internal, setting
 from sst_graph.factors.camera import PinholeCamera
@@ -27,10 +26,7 @@ from sst_graph.initialization.label_agreement import (
     States,
 )
 from sst_graph.stepwise import Stepwise
-from sst_graph.types import Guess, SemanticClass
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from sst_graph.types import FloatArray, Guess, IntArray, SemanticClass
 
 _GRID_STEP = np.radians(7.5)
 """Spacing of the rotation grid over all of SO(3), about half the widest blur's reach [rad]; the cost grows

@@ -19,11 +19,9 @@ from numpy.typing import NDArray
 from sst_graph.errors import EstimationError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.stepwise import Stepwise
-from sst_graph.types import SemanticClass
+from sst_graph.types import FloatArray, IntArray, SemanticClass
 
-FloatArray = NDArray[np.float64]
 Float32 = NDArray[np.float32]
-IntArray = NDArray[np.intp]
 
 CELLS = (10, 32)
 """Rows and columns of the cells of an image; the votes of a cell share one weight."""

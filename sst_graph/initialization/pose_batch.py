@@ -33,10 +33,7 @@ from sst_graph.factors.robust import RobustKernel
 from sst_graph.features.mask_contour import MIN_GRADIENT, ContourMap, are_unknown, well_inside
 from sst_graph.graph.matching import DriveEdges
 from sst_graph.initialization.label_agreement import States
-from sst_graph.types import SemanticClass
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from sst_graph.types import FloatArray, IntArray, SemanticClass
 
 _MIN_DEPTH_M = 0.5
 _REACH_M = 3.0

@@ -11,7 +11,6 @@ from dataclasses import fields, replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.building import PRIOR_ROTATION_SIGMA_RAD, PRIOR_TRANSLATION_SIGMA_M
@@ -19,9 +18,7 @@ from sst_graph.graph.matching import DriveEdges, GraphConfig
 from sst_graph.initialization.global_search import rotation_matrices
 from sst_graph.initialization.pose_batch import BatchEquations, PoseBatch, Poses
 from sst_graph.stepwise import Stepwise
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from sst_graph.types import FloatArray
 
 _LONGEST_RAD, _LONGEST_M, _LONGEST_S, _LONGEST_PX = 0.1, 0.3, 0.1, 3.0
 """Longest step of one iteration."""

@@ -26,10 +26,7 @@ from sst_graph.initialization.pose_batch import BatchEquations, Poses
 from sst_graph.initialization.refinement import RefinementProblem, refine_steps
 from sst_graph.sampling import evenly_spread
 from sst_graph.stepwise import Stepwise
-from sst_graph.types import Calibration
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from sst_graph.types import Calibration, FloatArray, IntArray
 
 SELECTION_SCANS = 10
 """Most scans of each drive that candidates are compared on."""

@@ -5,15 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.covariance.considered import BUDGET, SHIFTS
 from sst_graph.errors import printable
 from sst_graph.files.checked_values import is_number
 from sst_graph.result import CalibrationResult
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 _PARTS_OF_EDGES = {
     "objects": "which objects there are",

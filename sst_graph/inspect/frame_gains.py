@@ -18,7 +18,6 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.covariance.cluster_robust import RobustCovariance, covariance_of
 from sst_graph.covariance.error_model import ErrorModel, fit_error_model
@@ -33,9 +32,7 @@ from sst_graph.graph.state import State, time_offset_key, twist_key
 from sst_graph.inspect.frame_information import FrameInformation, positive_part
 from sst_graph.inspect.gained import bits_between
 from sst_graph.result import FrameId
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from sst_graph.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True)

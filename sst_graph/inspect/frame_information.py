@@ -11,13 +11,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.errors import DataError, printable
 from sst_graph.result import CalibrationResult, FrameId
-from sst_graph.types import ByValue
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import ByValue, FloatArray
 
 KEY = "frame_information"
 """Key in the diagnostics of a result."""

@@ -13,16 +13,13 @@ from typing import Any, Literal, get_args
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.errors import DataError, printable
 from sst_graph.graph.state import State
 from sst_graph.hand_eye.graph import PRIOR_SIGMAS, state_values
 from sst_graph.inspect.frame_information import MAX_NUMBER
 from sst_graph.result import CalibrationResult, FrameId
-from sst_graph.types import ByValue
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import ByValue, FloatArray
 
 KEY = "information_gained"
 """Key in the diagnostics of a result."""

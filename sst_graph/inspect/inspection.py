@@ -11,19 +11,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.covariance.observability import ObservabilityConfig, weak_directions
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.factors.arguments import described, is_whole
+from sst_graph.files.strict_json import json_able
 from sst_graph.inspect.frame_information import KEY, FrameInformation, frames_of
 from sst_graph.inspect.gained import Gained, gained_of
 from sst_graph.inspect.pixels import pixel_covariance
 from sst_graph.inspect.planning import Plan, limits_of, plan_recording
 from sst_graph.result import CalibrationResult, Sigmas, WeakDirection
-from sst_graph.types import ByValue
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import ByValue, FloatArray
 
 NAMES = ("rotation x", "rotation y", "rotation z", "x", "y", "z", "time offset")
 UNITS = ("deg", "deg", "deg", "cm", "cm", "cm", "ms")
@@ -238,31 +236,27 @@ def sigma_ellipse(covariance: FloatArray, count: int) -> FloatArray:
 def to_dict(inspection: Inspection) -> dict[str, Any]:
     """The inspection as a JSON-able dictionary; units in the names, SI but for sigmas in ``sigmas``."""
     result = inspection.result
-    return {
-        "status": result.status,
-        "reasons": list(result.reasons),
-        "method": result.method,
-        "T_camera_lidar": result.T_camera_lidar.matrix().tolist(),
-        "time_offset_s": result.time_offset_s,
-        "drive_offsets": [dataclasses.asdict(drive) for drive in result.drive_offsets],
-        "sigmas": {
-            "lidar_axes": dataclasses.asdict(inspection.lidar),
-            "camera_axes": dataclasses.asdict(inspection.camera),
-        },
-        "pixels": [dataclasses.asdict(pixel) for pixel in inspection.pixels],
-        "order": list(NAMES),
-        "correlation": inspection.correlation.tolist(),
-        "strong_correlations": [dataclasses.asdict(pair) for pair in inspection.strong],
-        "weak_directions": [_direction(weak) for weak in result.weak_directions],
-        "weakest_direction": _direction(inspection.weakest),
-        "frames": [_frame(frame, k in inspection.redundant) for k, frame in enumerate(inspection.frames)],
-        "plan": None if inspection.plan is None else inspection.plan.to_dict(),
-        "gained": None if inspection.gained is None else _gained(inspection.gained),
-    }
-
-
-def _direction(weak: WeakDirection) -> dict[str, Any]:
-    return {**dataclasses.asdict(weak), "vector": np.asarray(weak.vector).tolist()}
+    document: dict[str, Any] = json_able(
+        {
+            "status": result.status,
+            "reasons": result.reasons,
+            "method": result.method,
+            "T_camera_lidar": result.T_camera_lidar,
+            "time_offset_s": result.time_offset_s,
+            "drive_offsets": result.drive_offsets,
+            "sigmas": {"lidar_axes": inspection.lidar, "camera_axes": inspection.camera},
+            "pixels": inspection.pixels,
+            "order": NAMES,
+            "correlation": inspection.correlation,
+            "strong_correlations": inspection.strong,
+            "weak_directions": result.weak_directions,
+            "weakest_direction": inspection.weakest,
+            "frames": [_frame(frame, k in inspection.redundant) for k, frame in enumerate(inspection.frames)],
+            "plan": inspection.plan,
+            "gained": None if inspection.gained is None else _gained(inspection.gained),
+        }
+    )
+    return document
 
 
 def _gained(gained: Gained) -> dict[str, Any]:

@@ -25,9 +25,7 @@ from sst_graph.inspect.planning import Plan, Prediction
 from sst_graph.inspect.planning import limits_of as limits_of_result
 from sst_graph.inspect.verdict import fit_line
 from sst_graph.result import CalibrationResult
-
-FloatArray = NDArray[np.float64]
-
+from sst_graph.types import FloatArray
 
 MOST_SENTENCES = 5
 """Correlations that are put into words."""

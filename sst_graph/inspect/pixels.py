@@ -7,14 +7,12 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.assumptions.model import Scene, View
 from sst_graph.files.checked_values import is_number
 from sst_graph.result import CalibrationResult
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 
 def cP_H_cTl(cTl: gtsam.Pose3, cP: FloatArray) -> FloatArray:

@@ -17,7 +17,6 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.covariance.observability import ObservabilityConfig, worst_ratio
 from sst_graph.inspect.frame_information import (
@@ -28,9 +27,7 @@ from sst_graph.inspect.frame_information import (
     with_offset,
 )
 from sst_graph.result import CalibrationResult
-from sst_graph.types import ByValue
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import ByValue, FloatArray
 
 ASSUMPTIONS = "assumptions"
 """Key among a result's diagnostics of what it assumes: by name, deviation and sensitivity."""
@@ -80,10 +77,6 @@ class Prediction(ByValue):
     bits: float
     enough: int | None
 
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
-        return {**dataclasses.asdict(self), "sigmas": self.sigmas.tolist()}
-
 
 @dataclass(frozen=True)
 class View:
@@ -124,32 +117,19 @@ class Plan:
         """The best motion."""
         return self.motions[0]
 
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able; sigmas in the covariance's order [rad, m, s]."""
-        return {
-            "count": self.count,
-            "now": self.now.to_dict(),
-            "elsewhere": self.elsewhere.to_dict(),
-            "motions": [motion.to_dict() for motion in self.motions],
-            "nearer": self.nearer.to_dict(),
-            "views": [
-                {"position": view.position, "prediction": view.prediction.to_dict()} for view in self.views
-            ],
-        }
-
 
 def plan_recording(result: CalibrationResult, frames: Sequence[FrameInformation], count: int) -> Plan:
     """Predictions for ``count`` further frames; ``frames`` is not empty."""
     limits, lasting = limits_of(result), considered_covariance(result)
     views = np.stack([frame.view for frame in frames])
-    proposals = motion_proposals(result.T_camera_lidar, frames, views.mean(axis=0))
+    twists = motion_twists(result.T_camera_lidar, frames)
+    proposals = [Proposal(way, _mean_information(views.mean(axis=0), each)) for way, each in twists.items()]
     again = Proposal("as in this record", np.mean([frame.information for frame in frames], axis=0))
 
     def predicted(proposal: Proposal, number: int = count, search: bool = True) -> Prediction:
         return predict(result.covariance, proposal, number, limits, search, lasting)
 
     motions = sorted((predicted(p) for p in (*proposals, again)), key=lambda p: (p.worst, -p.bits))
-    twists = motion_twists(result.T_camera_lidar, frames)
     best = next((name for name in (motion.name for motion in motions) if name in twists), "standing")
     halved = nearer(views.mean(axis=0), result.T_camera_lidar)
     by_view = [
@@ -242,15 +222,6 @@ def _numbers(entry: Any) -> FloatArray | None:
     except (KeyError, TypeError, ValueError, OverflowError):
         return None
     return numbers if numbers.shape == (8,) and (np.abs(numbers) <= MAX_NUMBER).all() else None
-
-
-def motion_proposals(
-    cTl: gtsam.Pose3, frames: Sequence[FrameInformation], view: FloatArray
-) -> list[Proposal]:
-    """Ways to drive, all with one view (6, 6)."""
-    return [
-        Proposal(name, _mean_information(view, twists)) for name, twists in motion_twists(cTl, frames).items()
-    ]
 
 
 def motion_twists(cTl: gtsam.Pose3, frames: Sequence[FrameInformation]) -> dict[str, FloatArray]:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.errors import count_of
 from sst_graph.factors.camera import PinholeCamera
@@ -15,8 +14,7 @@ from sst_graph.fit import CLOSE_PX, EDGES_QUALITY, FitQuality
 from sst_graph.inspect.pixels import cP_H_cTl, pixel_covariance
 from sst_graph.inspect.reasons import as_sentence, short_reasons
 from sst_graph.result import CalibrationResult
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 REACHES_M = (10.0, 30.0, 60.0)
 """Depths for which the error in the picture is given [m]."""

@@ -10,13 +10,10 @@ fitted; residuals are enlarged for that, by how many of them are independent.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.fit import CLOSE_PX
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from sst_graph.types import FloatArray, IntArray
 
 SIDES_OF_STRETCH = 24
 """Fewest sides of objects that a stretch has, counted in each frame: eight for each angle that is fitted."""

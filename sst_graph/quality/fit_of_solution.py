@@ -18,8 +18,6 @@ from sst_graph.quality.close_points import attainable_share, close_share
 from sst_graph.quality.residuals import Measured, measure_points
 from sst_graph.types import SemanticClass
 
-FloatArray = NDArray[np.float64]
-
 _POINTS_OF_SHARE = 10_000
 """Most points of a drive whose share is measured under other states."""
 _TURNED = 3

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.association.edge_matching import PairedEdges
 from sst_graph.edges.agreement import score_of_pairs
@@ -16,8 +15,7 @@ from sst_graph.fit import Profile
 from sst_graph.graph.frozen_problem import FrozenPoint, FrozenProblem
 from sst_graph.graph.matching import DriveEdges
 from sst_graph.graph.state import State
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 _STEPS = (1.0, 2.0, 3.0, 4.0)
 """How far a profile goes to either side, in standard deviations."""

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.association.edge_matching import SIDES
 from sst_graph.factors import residuals
@@ -16,9 +15,7 @@ from sst_graph.graph.matching import DriveEdges, DriveMatches, match_all
 from sst_graph.graph.outer_loop import KERNELS_PX
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import ObjectId
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from sst_graph.types import IntArray
 
 WIDE_PX = 5.0
 """Kernel scale under which contours are nearby: up to 15 px away, three times as far as for an estimate

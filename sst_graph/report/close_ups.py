@@ -19,10 +19,7 @@ from sst_graph.report.drawn_frame import DrawnFrame, DriveReader
 from sst_graph.report.html import jpeg, text
 from sst_graph.report.overlay import Placements, project_points
 from sst_graph.result import CalibrationResult
-from sst_graph.types import SemanticClass
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from sst_graph.types import FloatArray, IntArray, SemanticClass
 
 COUNT = 10
 """Close-ups of a report."""

@@ -7,15 +7,12 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.data.frame_parts import RecentReader
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.factors.motion import CameraTwist, move_points
 from sst_graph.fit import MatchedFrame
-from sst_graph.types import CameraImage, Scan, Source
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import CameraImage, FloatArray, Scan, Source
 
 
 @dataclass(frozen=True)

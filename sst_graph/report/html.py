@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 from collections.abc import Iterable, Sequence
+from importlib.resources import files
 
 import cv2
 import numpy as np
@@ -21,6 +22,23 @@ def text(words: str) -> str:
 def printable(words: str) -> str:
     """Words that a file can hold: names of files may have bytes that are no text."""
     return words.encode("utf-8", "backslashreplace").decode("utf-8")
+
+
+def packaged(name: str, package: str = "sst_graph.report") -> str:
+    """A text file of a package."""
+    return files(package).joinpath(name).read_text(encoding="utf-8")
+
+
+def page(title: str, body: Iterable[str], style: str, script: str) -> str:
+    """A whole page, which loads nothing from elsewhere."""
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        '<link rel="icon" href="data:,">\n'
+        f"<title>{text(title)}</title>\n<style>\n{style}</style>\n</head>\n<body>\n"
+        f"<h1>{text(title)}</h1>\n<main>\n" + "\n".join(body) + "\n</main>\n"
+        f"<script>\n{script}</script>\n</body>\n</html>\n"
+    )
 
 
 def section(name: str, title: str, *blocks: str) -> str:

@@ -14,9 +14,7 @@ from sst_graph.features.mask_contour import ContourMap
 from sst_graph.fit import PointResiduals
 from sst_graph.report.drawn_frame import DrawnFrame
 from sst_graph.report.html import jpeg, packed, text
-from sst_graph.types import Calibration, SemanticClass
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import Calibration, FloatArray, SemanticClass
 
 _MOST_WIDTH = 1600
 """Wider pictures are made smaller [px]."""

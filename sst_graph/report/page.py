@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from typing import Any
 
 import numpy as np
@@ -24,6 +23,8 @@ from sst_graph.report.html import (
     bullets,
     details,
     grid,
+    packaged,
+    page,
     paragraph,
     preformatted,
     section,
@@ -114,18 +115,7 @@ def report_html(inputs: ReportInputs) -> str:
     title = f"Calibration of {result.image_topic or result.camera_name}" + (
         f" from {drives}" if drives else ""
     )
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        '<link rel="icon" href="data:,">\n'
-        f"<title>{text(title)}</title>\n<style>\n{_file('page.css')}</style>\n</head>\n<body>\n"
-        f"<h1>{text(title)}</h1>\n<main>\n" + "\n".join(body) + "\n</main>\n"
-        f"<script>\n{_file('page.js')}</script>\n</body>\n</html>\n"
-    )
-
-
-def _file(name: str) -> str:
-    return files("sst_graph.report").joinpath(name).read_text(encoding="utf-8")
+    return page(title, body, style=packaged("page.css"), script=packaged("page.js"))
 
 
 def _verdict(inputs: ReportInputs) -> str:

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.errors import count_of
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.fit import CLOSE_PX, Fit, PointResiduals
 from sst_graph.report.chart import Chart
 from sst_graph.report.html import figure
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from sst_graph.types import FloatArray, IntArray
 
 _MOST_OBJECTS = 30
 """Objects of the chart: those with the most points."""

@@ -6,15 +6,12 @@ from collections.abc import Sequence
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.fit import Fit, Profile
 from sst_graph.inspect.inspection import HUMAN, NAMES, UNITS, Correlation, correlation_matrix, sigma_ellipse
 from sst_graph.report.chart import Chart
 from sst_graph.report.html import figure, table, text
 from sst_graph.result import CalibrationResult
-
-FloatArray = NDArray[np.float64]
 
 _LEAST_SIGMAS = 1e-3
 """Distances below are drawn at it: they are nothing beside the uncertainty."""

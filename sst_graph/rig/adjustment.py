@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.covariance.contradiction import Difference, name_step
 from sst_graph.factors import camera_pose_factor
@@ -15,8 +14,7 @@ from sst_graph.factors.camera_pose import camera_pose_error
 from sst_graph.graph.linear import information_inverse
 from sst_graph.rig.known import TRIGGER_SIGMA_S, KnownPose, KnownRig
 from sst_graph.rig.marginal import RigMarginal
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 FALSE_ALARM = 1e-3
 """Probability that any known pose seems to contradict the estimates of a rig where none does."""

@@ -9,7 +9,6 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.batch.by_edges.choice import with_method_for_cameras, with_method_of
 from sst_graph.batch.by_edges.method import edges_method
@@ -48,10 +47,8 @@ from sst_graph.rig.joint_covariance import JointCovariance, joint_covariance
 from sst_graph.rig.known import KnownRig
 from sst_graph.rig.marginal import RigMarginal
 from sst_graph.rig.result import RigResult, worst
-from sst_graph.types import Guess, Source
+from sst_graph.types import FloatArray, Guess, Source
 from sst_graph.validation import checked_guess
-
-FloatArray = NDArray[np.float64]
 
 CameraSources = Source | Sequence[Source]
 

@@ -25,8 +25,8 @@ from sst_graph.graph.elimination import twist_responses
 from sst_graph.graph.matching import PairMatches
 from sst_graph.graph.outer_loop import JointSolution
 from sst_graph.graph.state import EXTRINSIC, time_offset_key, twist_key
+from sst_graph.types import FloatArray
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 UNKNOWNS = 7

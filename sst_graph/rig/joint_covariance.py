@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 from sst_graph.covariance.shared_errors import SharedErrors, by_common_errors
 from sst_graph.graph.linear import unit_scale
 from sst_graph.rig.influences import KINDS, UNKNOWNS, CameraInfluences, Influence
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 _LEAST_COMMON = 8
 """Fewest errors in common from which a correlation is taken; of fewer it is called complete: an error in

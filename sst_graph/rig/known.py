@@ -7,13 +7,10 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.errors import ConfigError
 from sst_graph.factors.arguments import checked_gtsam, checked_number, checked_type
-from sst_graph.types import ByValue
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import ByValue, FloatArray
 
 ROTATION_SIGMA_DEG, TRANSLATION_SIGMA_M = 0.03, 0.002
 """How well a calibration with a target is taken to know the pose between two cameras, along each axis."""

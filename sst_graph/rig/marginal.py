@@ -9,7 +9,6 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.errors import ConfigError
 from sst_graph.factors import FactorError
@@ -18,9 +17,7 @@ from sst_graph.factors.custom.variables import checked_keys
 from sst_graph.graph.linear import information_inverse
 from sst_graph.graph.state import time_offset_key
 from sst_graph.rig.influences import UNKNOWNS
-from sst_graph.types import ByValue
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import ByValue, FloatArray
 
 
 def rig_keys(number: int) -> tuple[int, int]:

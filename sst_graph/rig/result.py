@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.factors.arguments import checked_type
@@ -25,8 +24,7 @@ from sst_graph.files.strict_json import strict_json
 from sst_graph.result import CALIBRATION_NAME, RIG_NAME, CalibrationResult, Status, check_status, read_result
 from sst_graph.rig.known import KnownPose, KnownRig
 from sst_graph.rig.marginal import RelativePose, RigMarginal
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 FORMAT = "sst-graph/rig"
 VERSION = 1
@@ -121,8 +119,8 @@ class RigResult:
             "covariance": self.covariance,
             "status": self.status,
             "reasons": self.reasons,
-            "camera_poses": [_pose_document(p) for p in self.marginal().relative_poses()],
-            "known": _known_document(self.known),
+            "camera_poses": self.marginal().relative_poses(),
+            "known": self.known,
             "diagnostics": self.diagnostics,
         }
 
@@ -203,33 +201,6 @@ def _names(table: JsonTable) -> tuple[str, ...]:
             f"1 to {_MOST_CAMERAS}, each of them once",
         )
     return names
-
-
-def _pose_document(pose: RelativePose) -> dict[str, Any]:
-    return {
-        "camera": pose.camera,
-        "reference": pose.reference,
-        "T_camera_reference": pose.T_camera_reference.matrix(),
-        "covariance": pose.covariance,
-        "time_offset_s": pose.time_offset_s,
-        "time_offset_sigma_s": pose.time_offset_sigma_s,
-    }
-
-
-def _known_document(known: KnownRig) -> dict[str, Any]:
-    return {
-        "one_trigger": known.one_trigger,
-        "poses": [
-            {
-                "camera": pose.camera,
-                "reference": pose.reference,
-                "T_camera_reference": pose.T_camera_reference.matrix(),
-                "rotation_sigma_deg": pose.rotation_sigma_deg,
-                "translation_sigma_m": pose.translation_sigma_m,
-            }
-            for pose in known.poses
-        ],
-    }
 
 
 def _known(table: JsonTable) -> KnownRig:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.classes import class_of_name, map_of_names
-from sst_graph.errors import DataError, MissingDependencyError, one_line
+from sst_graph.errors import DataError, one_line, optional_module
 from sst_graph.segmentation.label_numbers import LabelNumbers
 from sst_graph.segmentation.segmenter import ImageLabels
 from sst_graph.types import CameraImage, SemanticClass
@@ -119,12 +119,6 @@ def _kind(transformers: Any, config: Any) -> Any:
 
 
 def _modules(place: str) -> tuple[Any, Any]:
-    try:
-        import torch
-        import transformers
-    except ImportError:
-        raise MissingDependencyError(
-            f"{place}: models of Hugging Face need transformers and torch, which are not installed: "
-            "pip install 'sst-graph[hf]'"
-        ) from None
-    return transformers, torch
+    without = f"{place}: models of Hugging Face need transformers and torch, which are not installed"
+    torch = optional_module("torch", without, "hf")
+    return optional_module("transformers", without, "hf"), torch

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.errors import DataError, MissingDependencyError, count_of, one_line
+from sst_graph.errors import DataError, count_of, one_line, optional_module
 from sst_graph.files.reading import FileKind, digest_of_file
 from sst_graph.segmentation.label_numbers import LabelNumbers
 
@@ -157,13 +157,8 @@ def _described(session: Any, path: Path) -> tuple[list[tuple[str, str, tuple[Any
 
 
 def _runtime(path: Path) -> Any:
-    try:
-        import onnxruntime
-    except ImportError:
-        raise MissingDependencyError(
-            f"{path}: networks need onnxruntime, which is not installed: pip install 'sst-graph[onnx]'"
-        ) from None
-    return onnxruntime
+    without = f"{path}: networks need onnxruntime, which is not installed"
+    return optional_module("onnxruntime", without, "onnx")
 
 
 def weights_beside(path: Path) -> list[Path]:

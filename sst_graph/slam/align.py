@@ -40,10 +40,8 @@ from sst_graph.factors.robust import RobustKernel
 from sst_graph.features.lidar_edges import Boundaries, with_points
 from sst_graph.objects.occupancy import ObjectName
 from sst_graph.objects.velocity import velocities_of_points
-from sst_graph.types import CameraImage, Scan, SemanticClass
+from sst_graph.types import CameraImage, FloatArray, Scan, SemanticClass
 from sst_graph.validation import checked_image, checked_scan, checked_stamp
-
-FloatArray = NDArray[np.float64]
 
 VEHICLES = (SemanticClass.VEHICLE,)
 SLAM_MATCHES = MatchConfig(side_sigma_px=1.5)

@@ -9,7 +9,6 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.errors import DataError, count_of
 from sst_graph.factors import FactorError, Vector
@@ -23,10 +22,8 @@ from sst_graph.factors.custom.variables import (
     number_or_key,
     pose_or_key,
 )
-from sst_graph.types import SemanticClass
+from sst_graph.types import FloatArray, SemanticClass
 from sst_graph.validation import checked_stamp
-
-FloatArray = NDArray[np.float64]
 
 _CLASSES = tuple(SemanticClass)
 POSITIONS = slice(7 + len(_CLASSES), 7 + len(_CLASSES) + 2)

@@ -42,9 +42,7 @@ from sst_graph.slam.align import (
 )
 from sst_graph.slam.alignment_keys import COLUMNS, POSITIONS, AlignmentKeys, bias_column, body_pose
 from sst_graph.slam.object_sides import ObjectSides
-from sst_graph.types import CameraImage, Scan, SemanticClass
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import CameraImage, FloatArray, Scan, SemanticClass
 
 _LONGEST_S = 1e11
 """Offsets beyond this lie outside of every trajectory, as the nanoseconds of 64 bits do [s]."""

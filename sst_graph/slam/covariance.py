@@ -31,7 +31,6 @@ from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.batch.by_edges.covariance import FLOOR
 from sst_graph.config import expect_settings
@@ -49,9 +48,7 @@ from sst_graph.slam.checked_terms import checked_terms, expect_factors_of
 from sst_graph.slam.config import RematchConfig
 from sst_graph.slam.object_sides import ObjectSides
 from sst_graph.slam.term_warnings import TermWarning, WarningKind, last_warnings
-from sst_graph.types import SemanticClass
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray, SemanticClass
 
 MASK_BIAS_PX = 1.0
 """Deviation of a class's mask bias that is no variable [px]: networks and people outline objects a pixel

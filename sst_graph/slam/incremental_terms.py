@@ -14,7 +14,6 @@ from typing import Any, cast
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.config import expect_settings
 from sst_graph.errors import EstimationError
@@ -45,8 +44,7 @@ from sst_graph.slam.term_warnings import (
     uncertainty_px,
     wide_uncertainty,
 )
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 Solver = gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother
 

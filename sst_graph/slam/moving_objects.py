@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.drive.preparation import ScanFeatures
 from sst_graph.errors import DataError, count_of
@@ -17,9 +16,7 @@ from sst_graph.objects.dynamic_objects import DynamicObjectTest
 from sst_graph.objects.occupancy import ObjectName
 from sst_graph.objects.tracks import ObjectTracker
 from sst_graph.slam.align import VEHICLES, scan_features_of
-from sst_graph.types import Scan, SemanticClass
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray, Scan, SemanticClass
 
 
 @dataclass(frozen=True)

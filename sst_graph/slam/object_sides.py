@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 
 from sst_graph.association.edge_matching import SIDES
 from sst_graph.slam.align import FrameAlignments
-from sst_graph.types import SemanticClass
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray, SemanticClass
 
 SAME_OBJECT_M = 1.5
 """Centres of an object's matched points in consecutive images lie nearer than this [m]: parked vehicles

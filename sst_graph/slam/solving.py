@@ -18,7 +18,6 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.config import expect_settings
 from sst_graph.errors import EstimationError, count_of
@@ -46,8 +45,7 @@ from sst_graph.slam.term_warnings import (
     last_warnings,
     wide_uncertainty,
 )
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 _STEP_PX = 0.1
 """At the last scale, a round that moves the matched points by less (RMS) ends the loop [px]: matches

@@ -8,16 +8,13 @@ from enum import Enum
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.association.edge_matching import GATE
 from sst_graph.graph.linear import covariance_root
 from sst_graph.slam.alignment_keys import AlignmentKeys
 from sst_graph.slam.alignment_term import TermMatches
 from sst_graph.slam.config import RematchConfig
-
-FloatArray = NDArray[np.float64]
-
+from sst_graph.types import FloatArray
 
 MOST_SIGMAS = 4.3
 """An estimate farther from the start contradicts what was known there: chi-squared of 7 exceeds its square

@@ -9,9 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sst_graph.assumptions.sweep import SWEEP
+from sst_graph.assumptions.of_time import SWEEP
 from sst_graph.batch.assumption_tests import ParameterTest, with_test_results
 from sst_graph.covariance.considered import Considered, considered_by_steps
 from sst_graph.covariance.undecided_sweep import SweepEffect
@@ -37,10 +36,9 @@ from sst_graph.tracker.window.relinearization import (
     scans_to_match,
 )
 from sst_graph.tracker.window.smoother import WindowSmoother
+from sst_graph.types import FloatArray
 
 _LOG = logging.getLogger(__name__)
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

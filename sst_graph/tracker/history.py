@@ -8,14 +8,12 @@ from itertools import pairwise
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.graph.linear import scaled_inverse
 from sst_graph.tracker.window.epochs import RetiredEpoch
 from sst_graph.tracker.window.gaussian import Gaussian, Point
 from sst_graph.tracker.window.smoother import WindowSmoother
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 MAX_EPOCHS = 5000
 """Epochs kept for smoothing: nearly an hour and a half, at some kilobytes each."""

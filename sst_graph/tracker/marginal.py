@@ -6,11 +6,8 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.marginal import CalibrationMarginal
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,18 +8,16 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.batch.assumption_tests import contradiction_sentence
 from sst_graph.batch.method_estimate import UNKNOWN_SIGMAS
 from sst_graph.covariance.observability import open_directions
 from sst_graph.result import WeakDirection
-from sst_graph.types import ByValue
+from sst_graph.types import ByValue, FloatArray
 
 if TYPE_CHECKING:
     from sst_graph.tracker.tracker import Tracker
 
-FloatArray = NDArray[np.float64]
 Sensor = Literal["image", "scan"]
 TrackStatus = Literal["starting", "ok", "unobservable", "unconfirmed", "contradicted", "alarm"]
 

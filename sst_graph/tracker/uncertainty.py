@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.batch.by_edges.positions import POSITIONS
 from sst_graph.batch.method_estimate import UNKNOWN_SIGMAS
@@ -16,8 +15,7 @@ from sst_graph.graph.linear import scaled_inverse
 from sst_graph.tracker.monitor.statistic import ComparedEstimate, EstimateCovariance
 from sst_graph.tracker.sums.held import EDGE_ERRORS, SHIFTS
 from sst_graph.tracker.window.smoother import WindowSmoother
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 
 @dataclass(frozen=True)

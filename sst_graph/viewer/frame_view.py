@@ -16,9 +16,7 @@ from sst_graph.graph.matching import PairMatches
 from sst_graph.report.drawn_frame import DrawnFrame
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.tracker.window.matcher import WindowMatcher
-from sst_graph.types import CameraImage, Frame, Scan, SemanticClass
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import CameraImage, FloatArray, Frame, Scan, SemanticClass
 
 _PICTURES = 24
 """Latest images that are kept until their scan is shown."""

@@ -18,15 +18,13 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.errors import ConfigError, MissingDependencyError
+from sst_graph.errors import ConfigError, optional_module
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.inspect.inspection import HUMAN
 from sst_graph.tracker.track_update import TrackUpdate
-from sst_graph.types import Calibration, SemanticClass
+from sst_graph.types import Calibration, FloatArray, SemanticClass
 from sst_graph.viewer.frame_view import FrameView, MatchView
 from sst_graph.viz.overlay import CLASS_COLOURS, IN_MASK, OTHER_COLOUR
-
-FloatArray = NDArray[np.float64]
 
 LIDAR = "world/lidar"
 CAMERA = f"{LIDAR}/camera"
@@ -65,14 +63,9 @@ def rerun() -> Any:
     Raises:
         MissingDependencyError: it is not installed.
     """
-    try:
-        import rerun as module
-        import rerun.blueprint
-    except ImportError as error:
-        raise MissingDependencyError(
-            "the viewer needs rerun-sdk, which is not installed: pip install 'sst-graph[rerun]'"
-        ) from error
-    return module
+    without = "the viewer needs rerun-sdk, which is not installed"
+    optional_module("rerun.blueprint", without, "rerun")
+    return optional_module("rerun", without, "rerun")
 
 
 class Recording:

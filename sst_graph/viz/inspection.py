@@ -8,15 +8,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.errors import count_of
 from sst_graph.inspect.inspection import HUMAN, NAMES, UNITS, Inspection, sigma_ellipse
 from sst_graph.inspect.planning import AT_REST_MPS, Plan
 from sst_graph.viz.graph_plot import draw_graph
 from sst_graph.viz.matplotlib_figure import figure_class
-
-FloatArray = NDArray[np.float64]
 
 _COLOURS = ("tab:red", "tab:green", "tab:blue")
 _TURNING_DEGPS = 5.0

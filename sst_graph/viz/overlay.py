@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.mask_contour import ContourMap
-from sst_graph.types import CameraImage, Frame, Scan, SemanticClass
+from sst_graph.types import CameraImage, FloatArray, Frame, Scan, SemanticClass
 
-FloatArray = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 Colour = tuple[int, int, int]
 

@@ -112,13 +112,8 @@ def test_the_package_offers_its_names_on_demand() -> None:
     assert done.stdout == "[] True\n"
 
 
-def test_the_old_name_of_an_option() -> None:
+def test_the_old_names_of_options() -> None:
     parse = build_parser().parse_args
     assert parse(["simulate", "x", "--delay", "-0.1"]).time_offset == -0.1
-
-
-def test_a_former_name_of_an_option_is_accepted_with_a_note(capsys: pytest.CaptureFixture[str]) -> None:
-    args = build_parser().parse_args(["calibrate", "x", "--delay-per-drive"])
-    assert args.time_offset_per_drive is True
-    assert "--delay-per-drive is now called --time-offset-per-drive" in capsys.readouterr().err
-    assert build_parser().parse_args(["calibrate", "x"]).time_offset_per_drive is None
+    assert parse(["calibrate", "x", "--delay-per-drive"]).time_offset_per_drive is True
+    assert parse(["calibrate", "x"]).time_offset_per_drive is None

@@ -8,13 +8,11 @@ import logging
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 import pytest
 
 from sst_graph.batch import CalibrationConfig
 from sst_graph.config import Settings, from_dict, setting, to_dict, walk_settings
-from sst_graph.config.old_names import with_new_names
-from sst_graph.config.renamed import CONSTANTS, RENAMED
+from sst_graph.config.old_names import FIXED, RENAMED, fixed_in, with_new_names
 from sst_graph.errors import ConfigError
 from sst_graph.experiments.registry import EXPERIMENTS
 from sst_graph.tracker.config import TrackerConfig
@@ -40,11 +38,10 @@ class Online(Settings):
 
 OLD = {"delay_s": "time_offset_s", "undersides.use": "lower_edges.use", "scans": "window"}
 SAME = {"delay_s": "time_offset_s", "lag.s": "time_offset_s"}
-GONE = {"undersides.support": "sst_graph.edges.SUPPORT = 30.0"}
 
 
 def new(cls: Any, data: dict[str, Any]) -> Any:
-    return with_new_names(cls, data, OLD, GONE)
+    return with_new_names(cls, data, OLD)
 
 
 def test_an_old_name_is_the_new_one_with_a_warning(caplog: pytest.LogCaptureFixture) -> None:
@@ -67,14 +64,22 @@ def test_known_names_pass_without_a_word(caplog: pytest.LogCaptureFixture) -> No
     assert new(Method, given) is given and not caplog.records
 
 
-@pytest.mark.parametrize("name", ["undersides.support", "calibration.undersides.support"])
-def test_a_constant_is_named_with_its_value(name: str) -> None:
-    tree: Any = 3.0
-    for key in reversed(name.split(".")):
-        tree = {key: tree}
-    message = f"'{name}' is not a setting: sst_graph.edges.SUPPORT = 30.0; leave it out"
-    with pytest.raises(ConfigError, match=f"^{message}$"):
-        new(Online if "calibration" in name else Method, tree)
+@pytest.mark.parametrize(
+    ("name", "place"),
+    [
+        ("sweep.window.voxel_m", "sst_graph.odometry.sweep"),
+        ("calibration.sweep.window.movers.voxel_m", "sst_graph.odometry.static_points"),
+        ("images", "sst_graph.tracker.inputs"),
+        ("image", ""),
+    ],
+)
+def test_what_is_fixed_is_named_with_its_place(name: str, place: str) -> None:
+    assert fixed_in(name) == place
+
+
+def test_a_name_that_is_misspelled_is_not_said_to_be_fixed() -> None:
+    with pytest.raises(ConfigError, match=r"unknown setting 'alarm\.chi'; did you mean 'alarm\.chi2'\?"):
+        from_dict(TrackerConfig, {"alarm": {"chi": 9.0}})
 
 
 def test_old_and_new_name_together_are_refused() -> None:
@@ -83,17 +88,17 @@ def test_old_and_new_name_together_are_refused() -> None:
 
 
 def test_several_old_names_of_one_setting_must_agree() -> None:
-    assert with_new_names(Method, {"delay_s": 0.2, "lag": {"s": 0.2}}, SAME, {}) == {"time_offset_s": 0.2}
+    assert with_new_names(Method, {"delay_s": 0.2, "lag": {"s": 0.2}}, SAME) == {"time_offset_s": 0.2}
     with pytest.raises(ConfigError, match=r"'delay_s' and 'lag\.s', both called 'time_offset_s'"):
-        with_new_names(Method, {"delay_s": 0.2, "lag": {"s": 0.0}}, SAME, {})
+        with_new_names(Method, {"delay_s": 0.2, "lag": {"s": 0.0}}, SAME)
 
 
 def test_a_table_that_is_a_single_setting_now() -> None:
     moved = {"time_offset_s.mean": "time_offset_s"}
-    assert with_new_names(Method, {"time_offset_s": {"mean": 0.2}}, moved, {}) == {"time_offset_s": 0.2}
+    assert with_new_names(Method, {"time_offset_s": {"mean": 0.2}}, moved) == {"time_offset_s": 0.2}
     both = {"time_offset_s": {"mean": 0.2, "sigma": 0.1}}
     with pytest.raises(ConfigError, match="found both"):
-        with_new_names(Method, both, moved, {})
+        with_new_names(Method, both, moved)
     assert from_dict(CalibrationConfig, {"lower_edges": {"use": "never"}}).lower_edges == "never"
 
 
@@ -113,7 +118,7 @@ def test_what_the_tables_do_not_know_stays_to_be_refused(data: dict[str, Any]) -
 
 
 def test_a_value_in_the_place_of_the_new_table_is_refused() -> None:
-    with pytest.raises(ConfigError, match="lower_edges: found 3, expected a table"):
+    with pytest.raises(ConfigError, match=r"'undersides\.use' and 'lower_edges': found both"):
         from_dict(Method, new(Method, {"lower_edges": 3, "undersides": {"use": True}}))
 
 
@@ -135,18 +140,12 @@ def known_names() -> set[str]:
 
 def test_every_old_name_leads_to_a_setting() -> None:
     assert set(RENAMED.values()) <= known_names()
-    assert not (set(RENAMED) | set(CONSTANTS)) & known_names()
-    assert not set(RENAMED) & set(CONSTANTS)
+    assert not set(RENAMED) & (known_names() | set(FIXED))
 
 
-def test_every_constant_is_where_the_table_says_and_has_the_value() -> None:
-    for name, text in CONSTANTS.items():
-        place, equals, value = text.partition(" = ")
-        if equals:
-            module, _, constant = place.rpartition(".")
-            names = {"np": np, **vars(importlib.import_module(module))}
-            said = eval(value, names)  # as the module itself writes it; ... leaves it out
-            assert constant in names and repr(said) in ("Ellipsis", repr(names[constant])), (name, text)
+@pytest.mark.parametrize("place", sorted(set(FIXED.values())))
+def test_what_is_fixed_is_fixed_in_a_module(place: str) -> None:
+    importlib.import_module(place)
 
 
 @pytest.mark.parametrize("old", RENAMED)

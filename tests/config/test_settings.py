@@ -223,7 +223,8 @@ def test_rules_between_settings(settings: str, message: str) -> None:
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("joint.max_outer=0", "'joint.max_outer' is not a setting: sst_graph.graph.outer_loop."),
+        ("joint.max_outer=0", "unknown setting 'joint.max_outer'; it is fixed in sst_graph.graph.outer_loop"),
+        ("alarm.lost=3", "unknown setting 'alarm.lost'; it is fixed in sst_graph.tracker.monitor"),
         ("noise.lower_edges=[vehicle]", "unknown setting 'noise.lower_edges'"),
         ("noise.estimate=[focal]", "unknown setting 'noise.estimate'"),
         ("search.seed=1", "unknown setting 'search.seed'; did you mean 'seed'?"),

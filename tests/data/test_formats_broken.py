@@ -110,7 +110,7 @@ BROKEN: list[tuple[str, Change, str]] = [
     ("raw", edit("../calib_cam_to_cam.txt", "P_rect_02", "P_rect_09"), "no line P_rect_02"),
     ("raw", edit("../calib_cam_to_cam.txt", "S_rect_02: ", "S_rect_02: 1"), "pictures of 8x6 px"),
     ("raw", edit("../calib_velo_to_cam.txt", "R: ", "R: 1 "), "10 values for R"),
-    ("raw", edit("../calib_velo_to_cam.txt", "R: ", "R: nan "), "finite numbers for R"),
+    ("raw", edit("../calib_velo_to_cam.txt", "R: ", "R: nan "), "in R, expected finite numbers"),
     ("raw", edit("image_02/timestamps.txt", "2011-09-26", "26.09.2011"), "expected a stamp as 2011-09-26"),
     (
         "raw",

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-from sst_graph.errors import ConfigError, DataError, SstGraphError
+from sst_graph.errors import ConfigError, DataError, EstimationError, SstGraphError
 from sst_graph.experiments.resumable import Work, rows_of
 
 RUNS: list[int] = []
@@ -24,47 +26,84 @@ class Row:
     name: str = ""
 
 
-def squared(task: Task) -> list[Row]:
-    RUNS.append(task.number)
-    if task.number < 0:
-        raise DataError("a drive", "nothing", "something")
-    return [Row(float(task.number**2), str(task.number))]
+def squared(tasks: Sequence[Task]) -> Iterator[list[Row]]:
+    for task in tasks:
+        RUNS.append(task.number)
+        if task.number < 0:
+            raise DataError("a drive", "nothing", "something")
+        if task.number == 666:
+            os._exit(3)
+        yield [Row(float(task.number**2), str(task.number))]
 
 
 def work(path: Path, jobs: int = 1) -> Work[Task, Row]:
     return Work(squared, Row, jobs, str(path))
 
 
+def run(path: Path, *numbers: int) -> list[Row]:
+    return rows_of(work(path), [[Task(number) for number in numbers]])
+
+
 def test_only_what_is_not_done_is_run(tmp_path: Path) -> None:
     RUNS.clear()
     path = tmp_path / "records"
-    assert rows_of(work(path), [Task(2), Task(3)]) == [[Row(4.0, "2")], [Row(9.0, "3")]]
-    assert rows_of(work(path), [Task(3), Task(4), Task(2)])[1] == [Row(16.0, "4")]
+    assert run(path, 2, 3) == [Row(4.0, "2"), Row(9.0, "3")]
+    assert run(path, 3, 4, 2)[1] == Row(16.0, "4")
     assert RUNS == [2, 3, 4]
 
 
-def test_a_line_that_a_kill_left_unfinished_is_done_again(tmp_path: Path) -> None:
+@pytest.mark.parametrize("left", [1, 20])
+def test_a_line_that_a_kill_left_unfinished_is_done_again(tmp_path: Path, left: int) -> None:
     RUNS.clear()
     path = tmp_path / "records"
-    rows_of(work(path), [Task(2), Task(3)])
-    path.write_bytes(path.read_bytes()[:-20])
-    assert rows_of(work(path), [Task(2), Task(3)])[1] == [Row(9.0, "3")]
-    assert RUNS == [2, 3, 3]
-    assert rows_of(work(path), [Task(2), Task(3)])[1] == [Row(9.0, "3")]
-    assert RUNS == [2, 3, 3]
+    run(path, 2, 3)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-left])
+    assert run(path, 2, 3)[1] == Row(9.0, "3")
+    assert RUNS == [2, 3, 3] and path.read_bytes() == whole
+
+
+def test_a_kill_before_the_first_line(tmp_path: Path) -> None:
+    path = tmp_path / "records"
+    run(path, 2)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:20])
+    assert run(path, 2) == [Row(4.0, "2")] and path.read_bytes() == whole
+
+
+def test_one_run_at_a_time(tmp_path: Path) -> None:
+    path = tmp_path / "records"
+
+    def within(tasks: Sequence[Task]) -> Iterator[list[Row]]:
+        with pytest.raises(ConfigError, match="another run is writing it"):
+            run(path, 2)
+        yield []
+
+    assert rows_of(Work(within, Row, records=str(path)), [[Task(1)]]) == []
 
 
 def test_what_was_done_before_an_error_is_kept(tmp_path: Path) -> None:
     RUNS.clear()
     with pytest.raises(DataError):
-        rows_of(work(tmp_path / "records"), [Task(5), Task(-1)])
-    rows_of(work(tmp_path / "records"), [Task(5)])
+        run(tmp_path / "records", 5, -1)
+    run(tmp_path / "records", 5)
     assert RUNS == [5, -1]
 
 
 def test_processes_give_the_same_rows_in_the_order_of_the_tasks(tmp_path: Path) -> None:
-    tasks = [Task(k) for k in range(4)]
-    assert rows_of(work(tmp_path / "records", jobs=2), tasks) == rows_of(Work(squared, Row), tasks)
+    groups = [[Task(0), Task(1)], [Task(2)], [Task(3)]]
+    assert rows_of(work(tmp_path / "records", jobs=2), groups) == rows_of(Work(squared, Row), groups)
+
+
+def test_errors_of_processes(tmp_path: Path) -> None:
+    path = tmp_path / "records"
+    with pytest.raises(DataError, match="a drive: found nothing"):
+        rows_of(work(path, jobs=2), [[Task(-1)]])
+    died = r"Task\(number=1\): its process ended \(exit code 3\) with 1 of 2 runs left"
+    with pytest.raises(EstimationError, match=died):
+        rows_of(work(path, jobs=2), [[Task(1), Task(666)], [Task(3)]])
+    RUNS.clear()
+    assert run(path, 1, 3) == [Row(1.0, "1"), Row(9.0, "3")] and RUNS == []
 
 
 @pytest.mark.parametrize(
@@ -75,6 +114,8 @@ def test_processes_give_the_same_rows_in_the_order_of_the_tasks(tmp_path: Path) 
         '{"format": "sst-graph/experiment-records", "version": 1}\n{"task": "a", "rows": [{"value": "x"}]}\n',
         '{"format": "sst-graph/experiment-records", "version": 1}\n{"task": "a", "rows": [3]}\n',
         '{"format": "sst-graph/experiment-records", "version": 1}\n[]\n',
+        '{"format": "sst-graph/experiment-records", "version": 2}\n',
+        "[]\n",
         "\udcff",
     ],
 )
@@ -83,13 +124,13 @@ def test_other_files_are_refused_in_a_line(tmp_path: Path, content: str) -> None
     path.write_bytes(content.encode(errors="surrogateescape"))
     before = path.read_bytes()
     with pytest.raises(SstGraphError) as caught:
-        rows_of(work(path), [Task(2)])
+        run(path, 2)
     assert "records" in str(caught.value) and "\n" not in str(caught.value)
     assert path.read_bytes() == before
 
 
 def test_a_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SstGraphError):
-        rows_of(work(tmp_path), [Task(2)])
+        run(tmp_path, 2)
     with pytest.raises(ConfigError, match="cannot be written"):
-        rows_of(work(tmp_path / "none" / "records"), [Task(2)])
+        run(tmp_path / "none" / "records", 2)

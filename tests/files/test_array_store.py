@@ -144,5 +144,5 @@ def test_a_file_that_cannot_be_mapped_is_read(monkeypatch: pytest.MonkeyPatch) -
     def refused(*args: object, **kwargs: object) -> None:
         raise OSError("no such device")
 
-    monkeypatch.setattr("sst_graph.files.array_store.mmap.mmap", refused)
+    monkeypatch.setattr("mmap.mmap", refused)
     np.testing.assert_array_equal(stored.get(), large)

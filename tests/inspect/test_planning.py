@@ -11,6 +11,7 @@ import pytest
 
 from sst_graph.covariance.observability import ObservabilityConfig
 from sst_graph.factors.camera import PinholeCamera
+from sst_graph.files.strict_json import json_able
 from sst_graph.inspect.frame_information import FrameInformation, with_offset
 from sst_graph.inspect.planning import (
     Proposal,
@@ -98,7 +99,7 @@ def test_an_assumption_that_takes_all_of_a_variance(
     for found in (plan.now, plan.best, *plan.motions):
         np.testing.assert_allclose(found.sigmas[taken], size, rtol=1e-6)  # no frames reduce it
         assert (np.delete(found.sigmas, taken) <= 1e-3 * (1.0 + 1e-6)).all()
-    assert json.dumps(plan.to_dict(), allow_nan=False)
+    assert json.dumps(json_able(plan), allow_nan=False)
     assert capfd.readouterr() == ("", "")
 
 

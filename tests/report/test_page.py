@@ -22,7 +22,7 @@ from stored import stored
 from streets import CROWDED_STREET, crowded_street
 
 from sst_graph import CalibrationConfig, calibrate
-from sst_graph.assumptions.focal_length import FOCAL
+from sst_graph.assumptions.of_camera import FOCAL
 from sst_graph.fit import Fit
 from sst_graph.inspect.verdict import verdict
 from sst_graph.report import ReportInputs, report_html

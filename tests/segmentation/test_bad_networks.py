@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import importlib
 import os
 import sys
 from collections.abc import Callable
@@ -328,16 +329,19 @@ def test_the_command_line_ends_with_2_and_one_line(
 def test_the_library_starts_without_the_extras(monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither importing the package nor reading its help imports what a network runs by."""
     found: list[str] = []
-    real = builtins.__import__
 
-    def watched(name: str, *args: Any, **kwargs: Any) -> Any:
-        if name.partition(".")[0] in ("onnxruntime", "torch", "transformers", "onnx"):
-            found.append(name)
-        return real(name, *args, **kwargs)
+    def watched(real: Callable[..., Any]) -> Callable[..., Any]:
+        def imported(name: str, *args: Any, **kwargs: Any) -> Any:
+            if name.partition(".")[0] in ("onnxruntime", "torch", "transformers", "onnx"):
+                found.append(name)
+            return real(name, *args, **kwargs)
+
+        return imported
 
     for name in [name for name in sys.modules if name.startswith("sst_graph.segmentation")]:
         monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setattr(builtins, "__import__", watched)
+    monkeypatch.setattr(builtins, "__import__", watched(builtins.__import__))
+    monkeypatch.setattr(importlib, "import_module", watched(importlib.import_module))
     __import__("sst_graph.segmentation")
     assert found == []
 

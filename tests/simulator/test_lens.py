@@ -16,8 +16,8 @@ from sst_graph.data.rectified import RectifiedSource
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.metrics import calibration_errors
 from sst_graph.simulator import SimulationConfig, simulate
-from sst_graph.simulator.camera.lens import LensDrive
 from sst_graph.types import SemanticClass, Source
+from studies.simulators.lens import LensDrive
 
 STREET = SimulationConfig(
     seed=3,

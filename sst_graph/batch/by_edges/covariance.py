@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import hadamard
 
 from sst_graph.assumptions import OF_LIDAR
@@ -39,9 +38,7 @@ from sst_graph.graph.outer_loop import JointProblem
 from sst_graph.graph.state import State, difference
 from sst_graph.objects.tracks import ObjectId
 from sst_graph.stepwise import Stepwise, run_to_end
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from sst_graph.types import BoolArray, FloatArray
 
 FLOOR = np.array([0.0, 0.0, 0.0, 0.01, 0.01, 0.01, 0.004])
 """(7,) sigmas that are added [rad, m, s]. That of the translation is for the 2 cm by which two real drives of

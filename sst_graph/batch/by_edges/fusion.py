@@ -20,14 +20,12 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.batch.method_estimate import MethodEstimate
 from sst_graph.batch.motion_factor import UNLIKELY_CHI2
 from sst_graph.covariance.shared_errors import by_common_errors
 from sst_graph.graph.state import State, difference
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.batch.by_edges.covariance import SAMPLES
 from sst_graph.batch.by_edges.reasons import MIN_OVER_OTHER
@@ -26,8 +25,7 @@ from sst_graph.graph.outer_loop import JointProblem, solve_joint
 from sst_graph.graph.state import State, difference
 from sst_graph.sampling import evenly_spread
 from sst_graph.stepwise import run_to_end
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 _LEAST_SCANS = 8
 """Fewest scans of a half."""

@@ -21,7 +21,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.assumptions import ASSUMPTIONS, named_sigmas
 from sst_graph.batch.assumption_tests import ParameterTest, few_objects_factor
@@ -39,10 +38,9 @@ from sst_graph.graph.outer_loop import JointProblem, support_of
 from sst_graph.graph.state import State, difference
 from sst_graph.objects.tracks import ObjectId
 from sst_graph.stepwise import Stepwise, run_to_end
-from sst_graph.types import Guess
+from sst_graph.types import FloatArray, Guess
 
 _LOG = logging.getLogger(__name__)
-FloatArray = NDArray[np.float64]
 
 MATTERS_SIGMAS = 2.0
 """A step longer than this many standard deviations, on any axis, is a reason against an estimate; one that is

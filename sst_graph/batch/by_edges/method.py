@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.batch.by_edges.covariance import edges_covariance
 from sst_graph.batch.by_edges.halves import halves_reasons
@@ -28,9 +27,7 @@ from sst_graph.graph.state import difference
 from sst_graph.hand_eye.solution import MotionSolution
 from sst_graph.quality.profiles import score_profiles
 from sst_graph.stepwise import run_to_end
-from sst_graph.types import Guess
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray, Guess
 
 
 def edges_method(

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from sst_graph.association.edge_matching import TOP, MatchConfig, sampling_sigmas
 from sst_graph.batch.problem import JointEstimate
 from sst_graph.covariance.considered import Considered, steps_by, weighted_columns
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 POSITIONS = ("upward", "to_the_right", "outward")
 """All upper edges lie higher, all at the sides farther to the right, or farther out. One unit is the

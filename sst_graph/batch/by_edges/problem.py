@@ -9,7 +9,6 @@ from functools import cached_property
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.association.time_pairing import pair_by_time
 from sst_graph.assumptions import ASSUMPTIONS
@@ -27,9 +26,7 @@ from sst_graph.graph.outer_loop import JointProblem
 from sst_graph.graph.state import State, difference
 from sst_graph.hand_eye.solution import MotionSolution, alternative, solve_motion
 from sst_graph.sampling import evenly_spread
-from sst_graph.types import Guess
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray, Guess
 
 SEARCH_SCANS = 12
 """Scans of each drive that starts are compared on."""

@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.edges.agreement import score
 from sst_graph.edges.search import angle_deg
@@ -18,8 +17,7 @@ from sst_graph.graph.outer_loop import JointSolution
 from sst_graph.graph.state import State, difference
 from sst_graph.hand_eye.solution import MotionSolution
 from sst_graph.stepwise import Stepwise, run_to_end
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 SCORE_WORK = 5
 """A score of some scans, in units of work (:mod:`sst_graph.stepwise`)."""

@@ -7,17 +7,13 @@ from pathlib import Path
 
 from sst_graph.cli.messages import say
 from sst_graph.cli.options import build_parser
-from sst_graph.errors import MissingDependencyError
+from sst_graph.errors import optional_module
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the script of ``args.shell``."""
-    try:
-        import shtab
-    except ImportError as error:
-        raise MissingDependencyError(
-            "completion needs shtab, which is not installed: pip install 'sst-graph[completion]'"
-        ) from error
+    without = "completion needs shtab, which is not installed"
+    shtab = optional_module("shtab", without, "completion")
     parser = build_parser()
     _complete_paths(parser, shtab.FILE)
     say(shtab.complete(parser, args.shell))

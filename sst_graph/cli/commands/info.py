@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 
 from sst_graph.cli.messages import say
@@ -13,5 +14,5 @@ from sst_graph.data.info import drive_info, info_text
 def run(args: argparse.Namespace) -> int:
     """Print the summary of the drive."""
     info = drive_info(open_drive(args, args.data))
-    say(json.dumps(info.as_dict(), indent=1, ensure_ascii=False) if args.json else info_text(info))
+    say(json.dumps(dataclasses.asdict(info), indent=1, ensure_ascii=False) if args.json else info_text(info))
     return 0

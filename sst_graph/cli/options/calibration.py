@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from sst_graph.cli.options.base_parser import SIGN, Commands, Parser, Renamed
+from sst_graph.cli.options.base_parser import SIGN, Commands, Parser
 from sst_graph.cli.options.data import add_label_options, add_source_options
 from sst_graph.cli.options.method import add_estimate, add_method, add_settings
 
@@ -28,7 +28,11 @@ def add_calibrate(commands: Commands) -> argparse.ArgumentParser:
         "--time-offset-per-drive", action="store_true", default=None, help="one time offset for each drive"
     )
     calibrate.add_argument(
-        "--delay-per-drive", action=Renamed, const="--time-offset-per-drive", help=argparse.SUPPRESS
+        "--delay-per-drive",
+        dest="time_offset_per_drive",
+        action="store_true",
+        default=None,
+        help=argparse.SUPPRESS,
     )
     _add_rig(calibrate)
     calibrate.add_argument(

@@ -25,7 +25,7 @@ from sst_graph.data.pictures import PictureFiles, mask_encoding, point_labels
 from sst_graph.data.point_files import SUFFIXES, Cloud, read_cloud
 from sst_graph.data.rectified import RectifiedSource
 from sst_graph.data.scan_order import rings_from_order
-from sst_graph.data.source import TURNS, Loader, SourceOptions
+from sst_graph.data.source import Loader, SourceOptions
 from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
 from sst_graph.errors import ConfigError, DataError, count_of, printable
 from sst_graph.sweep_timing import SweepTiming
@@ -129,7 +129,7 @@ def open_folder(path: Path, options: SourceOptions) -> Source:
     scans = CloudFiles(
         clouds,
         _beside(clouds, path / "labels", (".label",)),
-        _timing(clouds, options),
+        options.timing(clouds.stamps_ns),
         options.sweep == "auto",
     )
 
@@ -156,17 +156,6 @@ def _check_options(path: Path, options: SourceOptions) -> None:
     if named not in cameras and cameras:
         given = "none is named" if options.camera == _DEFAULT_CAMERA else f"none is {options.camera!r}"
         raise ConfigError(f"{path}: cameras {', '.join(cameras)}: {given} (--camera)")
-
-
-def _timing(clouds: StampedFiles, options: SourceOptions) -> SweepTiming | None:
-    """Times by azimuth where the options name a sense of rotation."""
-    if options.sweep not in TURNS:
-        return None
-    if len(clouds.stamps_ns) < 2:
-        raise ConfigError(f"sweep {options.sweep!r}: the period of a turn needs two stamps or more")
-    period_s = float(np.median(np.diff(clouds.stamps_ns))) * 1e-9
-    start_rad = float(np.radians(options.sweep_start_deg))
-    return SweepTiming(TURNS[options.sweep], start_rad, period_s, options.sweep_stamp)
 
 
 def _beside(files: StampedFiles, folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:

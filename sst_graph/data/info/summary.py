@@ -120,10 +120,6 @@ class DriveInfo:
     notes: tuple[str, ...]
     missing: Mapping[str, tuple[str, ...]]
 
-    def as_dict(self) -> dict[str, Any]:
-        """As JSON has it."""
-        return asdict(self)
-
 
 def drive_info(source: Source) -> DriveInfo:
     """The summary of a drive; at most 2 SAMPLED frames are read.

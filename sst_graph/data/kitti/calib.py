@@ -13,15 +13,14 @@ from pathlib import Path
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.files.checked_values import checked_pose, pinhole_camera, put_line
+from sst_graph.files.checked_values import checked_pose, pinhole_camera
 from sst_graph.files.reading import CALIB_TXT, read_text
+from sst_graph.types import FloatArray
 
-FloatArray = NDArray[np.float64]
-
+_LINE = re.compile(r"P\d|Tr")
 MAX_ENTRY = 1e12
 """Of a projection matrix [px]: beyond it, or its inverse as a focal length, products overflow."""
 
@@ -117,32 +116,42 @@ def read_calibration(path: Path) -> KittiCalibration:
         DataError: a missing file, a line with the wrong number of values or a value that is no
             finite number, two lines of one name that differ, or a Tr whose rotation is none.
     """
-    text = read_text(path, CALIB_TXT)
-    matrices: dict[str, FloatArray] = {}
-    for number, line in enumerate(text.splitlines(), 1):
-        name, colon, values = line.partition(":")
-        name = name.strip()
-        if not colon or not re.fullmatch(r"P\d|Tr", name):
-            continue
-        place = f"{path}:{number}"
-        put_line(matrices, name, _matrix(values.split(), name, place), place)
+    lines = numbers_by_name(read_text(path, CALIB_TXT), _LINE, path, 12)
+    matrices = {name: values.reshape(3, 4) for name, values in lines.items()}
     projections = {int(name[1:]): matrix for name, matrix in matrices.items() if name != "Tr"}
     c0Tl = pose_from(matrices["Tr"], f"{path} (Tr)") if "Tr" in matrices else None
     return KittiCalibration(path, projections, c0Tl)
 
 
-def _matrix(words: list[str], name: str, place: str) -> FloatArray:
-    """(3, 4) matrix of twelve words."""
-    if len(words) != 12:
-        raise DataError(place, f"{count_of(len(words), 'value')} for {name}", "12")
-    try:
-        values = np.array([float(word) for word in words])
-    except ValueError:
-        wrong = next(word for word in words if not _is_number(word))
-        raise DataError(place, f"{wrong!r:.60} in {name}", "12 numbers") from None
-    if not np.isfinite(values).all():
-        raise DataError(place, f"NaN or inf in {name}", "12 finite numbers")
-    return values.reshape(3, 4)
+def numbers_by_name(
+    text: str, names: re.Pattern[str], place: str | Path, count: int | None = None
+) -> dict[str, FloatArray]:
+    """Numbers (n,) of the lines "NAME: NUMBER ...", by name; lines of other names are left out.
+
+    Args:
+        count: how many there have to be; None: any.
+
+    Raises:
+        DataError: another count, a value that is no finite number, or two lines of one name that differ.
+    """
+    lines: dict[str, FloatArray] = {}
+    expected = "finite numbers" if count is None else f"{count} numbers"
+    for number, line in enumerate(text.splitlines(), 1):
+        name, colon, rest = line.partition(":")
+        name, words, at = name.strip(), rest.split(), f"{place}:{number}"
+        if not colon or not names.fullmatch(name):
+            continue
+        if count is not None and len(words) != count:
+            raise DataError(at, f"{count_of(len(words), 'value')} for {name}", str(count))
+        wrong = next((word for word in words if not _is_number(word)), None)
+        if wrong is not None:
+            raise DataError(at, f"{wrong!r:.60} in {name}", expected)
+        values = np.array(words, np.float64)
+        if not np.isfinite(values).all():
+            raise DataError(at, f"NaN or inf in {name}", expected)
+        if not np.array_equal(lines.setdefault(name, values), values):
+            raise DataError(at, f"another {name} than above", f"one line {name}")
+    return lines
 
 
 def _is_number(word: str) -> bool:

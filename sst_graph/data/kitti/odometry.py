@@ -39,7 +39,7 @@ from sst_graph.data.kitti.odometry_layout import (
 from sst_graph.data.kitti.truth import drive_truth
 from sst_graph.data.pictures import PictureFiles, mask_encoding, point_labels
 from sst_graph.data.scan_order import rings_from_order
-from sst_graph.data.source import TURNS, Loader, SourceOptions
+from sst_graph.data.source import Loader, SourceOptions
 from sst_graph.data.two_clocks import DriveProperties, IndexedSource, Sensor, TwoClockSource, merged
 from sst_graph.errors import ConfigError, printable
 from sst_graph.sweep_timing import SweepTiming
@@ -171,8 +171,7 @@ def open_kitti(path: Path, options: SourceOptions) -> KittiSource | TwoClockSour
     image_stamps_ns = None if image_times is None else read_times(image_times)
     counts = FrameCounts(len(stamps_ns), None if image_stamps_ns is None else len(image_stamps_ns))
     files = find_files(folder, options.camera, options.cloud, counts)
-    if options.sweep in TURNS and len(stamps_ns) < 2:
-        raise ConfigError(f"sweep {options.sweep!r}: the period of a turn needs two stamps or more")
+    timing = options.timing(stamps_ns)
     size = picture_size(next(iter(files.images.values())))
     if missing := files.missing():
         _LOG.info("%s: %s", printable(folder), missing)
@@ -182,7 +181,6 @@ def open_kitti(path: Path, options: SourceOptions) -> KittiSource | TwoClockSour
     properties = DriveProperties(_name(folder), camera, nominal, truth, is_reference, *sweep)
     encoding = mask_encoding(files.masks, options.label_encoding, size)
     pictures = PictureFiles(size, files.images, files.masks, encoding)
-    timing = _timing(options, stamps_ns)
     if image_stamps_ns is not None:
         unshifted = replace(options, image_shift=0)
         source = KittiSource(properties, (), files, stamps_ns, unshifted, pictures, timing)
@@ -209,14 +207,6 @@ def _with_image_stamps(
 
     of_scans, of_images = Sensor(source.stamps_ns[scans], scan), Sensor(image_stamps_ns[images], image)
     return merged(source.properties, of_scans, of_images, options, folder)
-
-
-def _timing(options: SourceOptions, stamps_ns: NDArray[np.int64]) -> SweepTiming | None:
-    """Times by azimuth where the options name a sense of rotation."""
-    if options.sweep not in TURNS:
-        return None
-    start_rad, period_s = np.radians(options.sweep_start_deg), float(np.median(np.diff(stamps_ns))) * 1e-9
-    return SweepTiming(TURNS[options.sweep], float(start_rad), period_s, options.sweep_stamp)
 
 
 def _select(files: KittiFiles, options: SourceOptions, count: int) -> tuple[int, ...]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from sst_graph.data.arrays import listed, numbered_files
+from sst_graph.data.arrays import listed, numbered_files, optional_files
 from sst_graph.errors import ConfigError, DataError, count_of
 
 LAYOUT = (
@@ -136,9 +136,9 @@ def find_files(folder: Path, camera: str, cloud: str, counts: FrameCounts) -> Ki
             frames than stamps, labels of no scan, masks of no picture.
     """
     scans = numbered_files(folder / cloud, (".bin",))
-    labels = _optional(folder / "labels", (".label",))
+    labels = optional_files(folder / "labels", (".label",))
     images = numbered_files(folder / camera, _PICTURES)
-    masks = _optional(folder / camera.replace("image", "semantic"), (".png",))
+    masks = optional_files(folder / camera.replace("image", "semantic"), (".png",))
     if counts.image_stamps is None:
         _check_stamps(folder / "times.txt", counts.stamps, {**scans, **images, **masks}, "frames")
     else:
@@ -157,7 +157,7 @@ def find_files(folder: Path, camera: str, cloud: str, counts: FrameCounts) -> Ki
         point_times=_point_times(folder / f"{cloud}_times", scans),
         images=images,
         masks=masks,
-        instances=_optional(folder / camera.replace("image", "instance"), (".png",)),
+        instances=optional_files(folder / camera.replace("image", "instance"), (".png",)),
     )
 
 
@@ -171,11 +171,6 @@ def _check_stamps(times: Path, stamps: int, files: Mapping[int, Path], what: str
     if count != stamps:
         last = files[max(files)].name
         raise DataError(times, count_of(stamps, "stamp"), f"{count}, as there are {what} from 0 to {last}")
-
-
-def _optional(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
-    """Files of a folder that need not be there."""
-    return numbered_files(folder, suffixes) if folder.is_dir() else {}
 
 
 def _point_times(folder: Path, scans: Mapping[int, Path]) -> dict[int, Path] | None:

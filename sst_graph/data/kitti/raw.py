@@ -14,7 +14,7 @@ from __future__ import annotations
 import io
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import gtsam
@@ -27,7 +27,6 @@ from sst_graph.data.images import picture_size
 from sst_graph.data.kitti.raw_calib import RawCalibration, raw_camera_number, read_raw_calibration
 from sst_graph.data.kitti.raw_layout import (
     LAYOUT,
-    RawFiles,
     SweepTimes,
     calibration_folder,
     find_drive,
@@ -38,11 +37,11 @@ from sst_graph.data.kitti.truth import read_truth
 from sst_graph.data.pictures import PictureFiles, mask_encoding, point_labels
 from sst_graph.data.rectified import RectifiedSource
 from sst_graph.data.scan_order import rings_from_order
-from sst_graph.data.source import TURNS, Loader, SourceOptions
+from sst_graph.data.source import Loader, SourceOptions
 from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
-from sst_graph.errors import ConfigError, DataError, count_of, printable
+from sst_graph.errors import DataError, count_of, printable
 from sst_graph.files.reading import FileKind, read_text
-from sst_graph.sweep_timing import SweepStamp, SweepTiming
+from sst_graph.sweep_timing import SweepTiming
 from sst_graph.types import CameraImage, GroundTruth, Scan, Source, with_intensities
 
 TEXT_SCAN = FileKind("a cloud of lines x y z r", 64 * 1024 * 1024)
@@ -53,25 +52,19 @@ class TurnTimes:
     """Times of points by azimuth and by the start and end of their own sweep.
 
     Attributes:
-        fraction: 1 for a scanner that turns counter-clockwise, seen from above, -1 for clockwise.
-        start_rad: azimuth at which a turn begins [rad].
-        stamp: the instant that a stamp names where starts and ends are not known.
-        period_s: median interval between stamps [s].
+        timing: of a turn of the median period.
         sweeps: starts and ends; None: a turn takes the period.
     """
 
-    fraction: float
-    start_rad: float
-    stamp: SweepStamp
-    period_s: float
+    timing: SweepTiming
     sweeps: SweepTimes | None
 
     def offsets_s(self, number: int, stamp_ns: int, points: NDArray[np.float32]) -> NDArray[np.float32]:
         """Times (n,) of the points (n, 3) of a scan after its stamp [s]."""
         if self.sweeps is None:
-            return SweepTiming(self.fraction, self.start_rad, self.period_s, self.stamp).offsets_s(points)
+            return self.timing.offsets_s(points)
         start_ns, end_ns = int(self.sweeps.starts_ns[number]), int(self.sweeps.ends_ns[number])
-        turn = SweepTiming(self.fraction, self.start_rad, (end_ns - start_ns) * 1e-9, "start")
+        turn = replace(self.timing, period_s=(end_ns - start_ns) * 1e-9, stamp="start")
         return turn.offsets_s(points) + np.float32((start_ns - stamp_ns) * 1e-9)
 
 
@@ -146,7 +139,9 @@ def open_raw(path: Path, options: SourceOptions) -> Source:
     truth = _truth(drive, options.camera, nominal)
     encoding = mask_encoding(files.masks, options.label_encoding, size)
     pictures = PictureFiles(size, files.pictures, files.masks, encoding)
-    clouds = RawScans(files.scans, files.labels, _turn_times(files, options))
+    timing = options.timing(files.scan_stamps_ns)
+    turn = None if timing is None else TurnTimes(timing, files.sweeps)
+    clouds = RawScans(files.scans, files.labels, turn)
     scans = np.array(list(files.scans))
     images = np.array(sorted({*files.pictures, *(k for k in files.masks if k < len(files.image_stamps_ns))}))
     scan_stamps, image_stamps = files.scan_stamps_ns[scans], files.image_stamps_ns[images]
@@ -187,17 +182,6 @@ def _truth(drive: Path, camera: str, nominal: gtsam.Pose3) -> GroundTruth:
         found = f"the truth of {stored.camera}"
         raise DataError(drive / "groundtruth.json", found, f"that of {camera}")
     return stored.truth
-
-
-def _turn_times(files: RawFiles, options: SourceOptions) -> TurnTimes | None:
-    if options.sweep not in TURNS:
-        return None
-    stamps = files.scan_stamps_ns
-    if len(stamps) < 2:
-        raise ConfigError(f"sweep {options.sweep!r}: the period of a turn needs two stamps or more")
-    period_s = float(np.median(np.diff(stamps))) * 1e-9
-    start_rad = float(np.radians(options.sweep_start_deg))
-    return TurnTimes(TURNS[options.sweep], start_rad, options.sweep_stamp, period_s, files.sweeps)
 
 
 RAW_LOADER = Loader(recognizes=is_raw, open=open_raw, layout=LAYOUT)

@@ -19,12 +19,10 @@ from numpy.typing import NDArray
 
 from sst_graph.cameras import BrownConradyCamera, CameraModel
 from sst_graph.cameras.readers import camera_from_kitti_raw
-from sst_graph.data.kitti.calib import KittiCalibration, pose_from
+from sst_graph.data.kitti.calib import KittiCalibration, numbers_by_name, pose_from
 from sst_graph.errors import ConfigError, DataError, count_of
-from sst_graph.files.checked_values import put_line
 from sst_graph.files.reading import FileKind, read_text
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 KITTI_RAW_CALIB = FileKind("a KITTI raw calibration", 1024 * 1024)
 _LINE = re.compile(r"(?:[KDRTS]|[RSP]_rect)_\d\d|R|T", re.ASCII)
@@ -37,21 +35,7 @@ def parse_kitti_raw(text: str, place: str | Path = "calibration") -> dict[str, N
     Raises:
         DataError: a value of theirs is no finite number, or two lines of one key differ.
     """
-    lines: dict[str, NDArray[np.float64]] = {}
-    for number, line in enumerate(text.splitlines(), 1):
-        name, colon, words = line.partition(":")
-        if not colon or not _LINE.fullmatch(name.strip()):
-            continue
-        try:
-            values = np.array([float(word) for word in words.split()])
-        except ValueError:
-            values = np.array([np.nan])
-        if not np.isfinite(values).all():
-            raise DataError(
-                f"{place}:{number}", f"{words.strip()!r:.60}", f"finite numbers for {name.strip()}"
-            )
-        put_line(lines, name.strip(), values, f"{place}:{number}")
-    return lines
+    return numbers_by_name(text, _LINE, place)
 
 
 def read_kitti_raw(path: str | Path) -> dict[str, NDArray[np.float64]]:

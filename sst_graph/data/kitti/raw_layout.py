@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.data.arrays import listed, numbered_files
+from sst_graph.data.arrays import listed, numbered_files, optional_files
 from sst_graph.data.kitti.raw_calib import CAM_TO_CAM, VELO_TO_CAM
 from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.files.reading import FileKind, read_text
@@ -117,9 +117,9 @@ def find_raw_files(drive: Path, camera: int) -> RawFiles:
             raise DataError(folder / "timestamps.txt", count_of(len(stamps), "stamp"), expected)
     return RawFiles(
         scans=scans,
-        labels=_optional(drive / "labels", (".label",)),
+        labels=optional_files(drive / "labels", (".label",)),
         pictures=pictures,
-        masks=_optional(drive / f"semantic_{camera:02d}", (".png",)),
+        masks=optional_files(drive / f"semantic_{camera:02d}", (".png",)),
         scan_stamps_ns=scan_stamps,
         image_stamps_ns=image_stamps,
         sweeps=_sweeps(cloud, len(scan_stamps)),
@@ -166,10 +166,6 @@ def _sweeps(cloud: Path, count: int) -> SweepTimes | None:
         k = int(np.argmin((lengths > 0) & (lengths < NS_PER_S)))
         raise DataError(f"{paths[1]}:{k + 1}", f"a sweep of {lengths[k] * 1e-9:g} s", "0 to 1 s")
     return SweepTimes(starts, ends)
-
-
-def _optional(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
-    return numbered_files(folder, suffixes) if folder.is_dir() else {}
 
 
 def _drives(path: Path) -> list[Path]:

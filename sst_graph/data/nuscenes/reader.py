@@ -26,7 +26,7 @@ from sst_graph.data.arrays import MAX_POINTS, check_metres, listed
 from sst_graph.data.nuscenes.tables import Record, pose_of, records, text_of, whole_of
 from sst_graph.data.pictures import PictureFiles
 from sst_graph.data.rectified import RectifiedSource
-from sst_graph.data.source import TURNS, Loader, SourceOptions
+from sst_graph.data.source import Loader, SourceOptions
 from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
 from sst_graph.errors import ConfigError, DataError, count_of, printable
 from sst_graph.files.reading import FileKind, read_file
@@ -286,14 +286,7 @@ def _lidar_files(path: Path, tables: Path, lidar: Channel, options: SourceOption
             file = _inside(path, text_of(record, "filename", lidarseg), tables)
             if k is not None and file.exists():
                 labels[k] = file
-    timing = None
-    if options.sweep in TURNS:
-        if len(stamps_ns) < 2:
-            raise ConfigError(f"sweep {options.sweep!r}: the period of a turn needs two stamps or more")
-        period_s = float(np.median(np.diff(stamps_ns))) * 1e-9
-        start_rad = float(np.radians(options.sweep_start_deg))
-        timing = SweepTiming(TURNS[options.sweep], start_rad, period_s, options.sweep_stamp)
-    return LidarFiles(stamps_ns, _paths(path, tables, lidar), labels, timing)
+    return LidarFiles(stamps_ns, _paths(path, tables, lidar), labels, options.timing(stamps_ns))
 
 
 NUSCENES_LOADER = Loader(recognizes=is_nuscenes, open=open_nuscenes, layout=LAYOUT)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.errors import DataError, MissingDependencyError, SstGraphError, count_of, one_line
+from sst_graph.errors import DataError, SstGraphError, count_of, one_line, optional_module
 
 WHOLE_BAG = (
     "a whole ROS 1 bag, rosbag2 folder or mcap file; one that was cut short is repaired with "
@@ -78,18 +78,12 @@ class Bag:
         self.__init__(path)  # type: ignore[misc]
 
     def _open(self) -> None:
-        try:
-            from rosbags.rosbag1 import Reader as Reader1
-            from rosbags.rosbag2 import Reader as Reader2
-        except ImportError as error:
-            raise MissingDependencyError(
-                f"{self.path}: reading bags needs rosbags, which is not installed: "
-                "pip install 'sst-graph[ros]'"
-            ) from error
         self.is_ros1 = self.path.suffix == ".bag"
+        without = f"{self.path}: reading bags needs rosbags, which is not installed"
+        rosbags = optional_module(f"rosbags.rosbag{1 if self.is_ros1 else 2}", without, "ros")
         stack = ExitStack()
         try:
-            self._reader: Any = (Reader1 if self.is_ros1 else Reader2)(self.path)
+            self._reader: Any = rosbags.Reader(self.path)
             self._reader.open()
             stack.callback(_close, self._reader)
             connections = list(self._reader.connections)

@@ -21,9 +21,9 @@ from sst_graph.data.ros.frames import CloudReading, check_size, mask_classes, sc
 from sst_graph.data.ros.images import mask_of, picture_of
 from sst_graph.data.ros.index import BagIndex, Stamped, read_index
 from sst_graph.data.ros.topics import Topics, choose_topics
-from sst_graph.data.source import TURNS, Loader, SourceOptions
+from sst_graph.data.source import Loader, SourceOptions
 from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
-from sst_graph.errors import ConfigError, DataError, count_of, printable
+from sst_graph.errors import DataError, count_of, printable
 from sst_graph.sampling import evenly_spread
 from sst_graph.sweep_timing import SweepTiming
 from sst_graph.types import CameraImage, Scan, SemanticClass, Source
@@ -123,7 +123,7 @@ def open_ros(path: Path, options: SourceOptions) -> Source:
     nominal = None if oTl is None else geometry.extrinsic(oTl)
     if nominal is None:
         _LOG.info("%s: no nominal extrinsic: %s", printable(path), reason)
-    encoding, timing = _encoding(bag, topics, index, options), _timing(options, index)
+    encoding, timing = _encoding(bag, topics, index, options), options.timing(_stamps(index.clouds))
     messages = BagMessages(bag, topics, index, size, encoding, timing, options.sweep == "auto")
     notes = [f"camera model from {topics.info.name}"]
     if index.repeated:
@@ -181,17 +181,6 @@ def _encoding(bag: Bag, topics: Topics, index: BagIndex, options: SourceOptions)
         for place in evenly_spread(index.masks, _MASKS_TO_JUDGE)
     )
     return guess_mask_encoding(masks, f"{bag.path}, {mask.name}")
-
-
-def _timing(options: SourceOptions, index: BagIndex) -> SweepTiming | None:
-    """Times by azimuth where the options name a sense of rotation."""
-    if options.sweep not in TURNS:
-        return None
-    if len(index.clouds) < 2:
-        raise ConfigError(f"sweep {options.sweep!r}: the period of a turn needs two scans or more")
-    period_s = float(np.median(np.diff([one.stamp_ns for one in index.clouds]))) * 1e-9
-    start_rad = float(np.radians(options.sweep_start_deg))
-    return SweepTiming(TURNS[options.sweep], start_rad, period_s, options.sweep_stamp)
 
 
 def _read(bag: Bag, topics: Topics, index: BagIndex, place: Stamped, type_name: str) -> Any:

@@ -92,19 +92,15 @@ class Transforms:
         for parent, child in self._poses:
             neighbours.setdefault(parent, []).append(child)
             neighbours.setdefault(child, []).append(parent)
-        before: dict[str, str | None] = {start: None}
-        waiting = deque([start])
+        seen, waiting = {start}, deque([[start]])
         while waiting:
-            frame = waiting.popleft()
-            if frame == end:
-                path = [frame]
-                while (previous := before[path[-1]]) is not None:
-                    path.append(previous)
-                return path[::-1]
-            for other in neighbours.get(frame, ()):
-                if other not in before:
-                    before[other] = frame
-                    waiting.append(other)
+            path = waiting.popleft()
+            if path[-1] == end:
+                return path
+            for other in neighbours.get(path[-1], ()):
+                if other not in seen:
+                    seen.add(other)
+                    waiting.append([*path, other])
         return None
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +17,8 @@ from sst_graph.config import to_dict
 from sst_graph.drive.preparation import Drive, prepare_drive
 from sst_graph.experiments.paper.config import START, VARIANTS, PaperTableConfig
 from sst_graph.experiments.paper.drives import TableDrive
+from sst_graph.experiments.resumable import digest
 from sst_graph.experiments.starts import start_near, truth_of
-from sst_graph.files.strict_json import strict_json
 from sst_graph.metrics import calibration_errors
 from sst_graph.odometry.sweep import with_sweep
 from sst_graph.types import GroundTruth, Source
@@ -41,6 +40,9 @@ class Case:
     start: int
     method: str
 
+    def __str__(self) -> str:
+        return self.drive.name
+
     def key(self, config: PaperTableConfig) -> str:
         """Digest of all that its result depends on: settings of drive, start and method, and the version."""
         if self.drive.street is None:
@@ -56,7 +58,7 @@ class Case:
             "method": how,
             "version": sst_graph.__version__,
         }
-        return hashlib.sha256(strict_json(parts).encode()).hexdigest()[:24]
+        return digest(parts)
 
 
 @dataclass(frozen=True)
@@ -111,8 +113,8 @@ def cases_of(drives: Sequence[TableDrive], config: PaperTableConfig) -> list[lis
     ]
 
 
-def runs_of(cases: Sequence[Case], config: PaperTableConfig) -> Iterator[Run]:
-    """Run cases of one drive, which is read once, for the first method that needs it.
+def runs_of(cases: Sequence[Case], config: PaperTableConfig) -> Iterator[list[Run]]:
+    """The run of each of the cases of one drive, which is read once, for the first method that needs it.
 
     Raises:
         ConfigError, DataError: the drive cannot be used.
@@ -123,13 +125,13 @@ def runs_of(cases: Sequence[Case], config: PaperTableConfig) -> Iterator[Run]:
     for case in cases:
         start = start_of(case, config, truth.cTl)
         if case.method == START:
-            yield _run(case, start, None, truth)
+            yield [_run(case, start, None, truth)]
             continue
         prepared = prepared or [prepared_drive(source, config.calibration)]
         result = calibrate_prepared(prepared, start, config.calibration_of(case.method))
         offset_s = result.time_offset_s if VARIANTS[case.method].has_time_offset else None
         run = _run(case, result.T_camera_lidar, offset_s, truth)
-        yield dataclasses.replace(run, status=result.status, estimated=bool(result.frames_used))
+        yield [dataclasses.replace(run, status=result.status, estimated=bool(result.frames_used))]
 
 
 def prepared_drive(source: Source, calibration: CalibrationConfig) -> Drive:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from sst_graph.drive.preparation import Progress
 from sst_graph.experiments.paper.config import PaperTableConfig
 from sst_graph.experiments.paper.drives import table_drives
 from sst_graph.experiments.paper.plot import check_plot, plot_svg
-from sst_graph.experiments.paper.processes import run_groups
-from sst_graph.experiments.paper.run_log import open_log
-from sst_graph.experiments.paper.runs import Run, cases_of
+from sst_graph.experiments.paper.runs import Case, Run, cases_of, runs_of
 from sst_graph.experiments.paper.summary import Layout, Printed, csv_text, markdown
+from sst_graph.experiments.resumable import Work, rows_of
 
 STATE = "paper-tables.runs.jsonl"
 """File of runs in the folder of --out; the four tables share it, for some of their runs are the same."""
@@ -65,17 +65,9 @@ class PaperTable:
 
     def _runs(self, config: PaperTableConfig, progress: Progress | None, state: Path | None) -> list[Run]:
         """All runs of the table in its order."""
-        groups = cases_of(table_drives(config), config)
-        keys = {case: case.key(config) for group in groups for case in group}
-        with open_log(state) as log:
-            left = [[case for case in group if keys[case] not in log.runs] for group in groups]
-            done = len(keys) - sum(map(len, left))
-            for case, run in run_groups([group for group in left if group], config):
-                log.add(keys[case], run)
-                done += 1
-                if progress is not None:
-                    progress("runs", done, len(keys))
-            return [log.runs[key] for key in keys.values()]
+        run, key = partial(runs_of, config=config), partial(Case.key, config=config)
+        work = Work(run, Run, config.jobs, "" if state is None else str(state), key)
+        return rows_of(work, cases_of(table_drives(config), config), progress)
 
 
 TABLES: Mapping[str, PaperTable] = {

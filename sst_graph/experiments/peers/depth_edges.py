@@ -21,8 +21,7 @@ from scipy.ndimage import distance_transform_cdt
 
 from sst_graph.errors import EstimationError
 from sst_graph.experiments.peers.frames import PeerFrame, PeerProblem, moved_by
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 _ALPHA, _GAMMA = 1.0 / 3.0, 0.98
 _LEAST_JUMP_M = 0.3

@@ -16,9 +16,15 @@ from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.lidar_beams import arrange_beams
 from sst_graph.sampling import evenly_spread
-from sst_graph.types import CameraImage, RelativeMotion, Scan, SemanticClass, Source, intensities_of
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import (
+    CameraImage,
+    FloatArray,
+    RelativeMotion,
+    Scan,
+    SemanticClass,
+    Source,
+    intensities_of,
+)
 
 FARTHEST_M, NEAREST_M = 80.0, 2.0
 """Points outside are left out [m]."""

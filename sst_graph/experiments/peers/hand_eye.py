@@ -9,13 +9,11 @@ from __future__ import annotations
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.errors import EstimationError, count_of
 from sst_graph.experiments.peers.frames import PeerProblem
 from sst_graph.hand_eye.graph import camera_steps, lidar_paths, pair_motions
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 _FEWEST = 3
 """Pairs of motions: two axes determine a rotation, noise needs more."""

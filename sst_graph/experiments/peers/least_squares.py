@@ -13,7 +13,6 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
@@ -21,9 +20,7 @@ from scipy.spatial import cKDTree
 from sst_graph.association.nearest import sample_pixels
 from sst_graph.errors import EstimationError
 from sst_graph.experiments.peers.frames import PeerFrame, PeerProblem, moved_by
-from sst_graph.types import SemanticClass
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray, SemanticClass
 
 _POINTS, _PIXEL_SHARE = 800, 0.02
 """Most points of a frame; share of the mask's pixels: the paper's."""

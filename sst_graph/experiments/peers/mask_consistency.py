@@ -19,16 +19,12 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from sst_graph.experiments.peers.frames import PeerFrame, PeerProblem, moved_by
-from sst_graph.types import SemanticClass
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from sst_graph.types import FloatArray, IntArray, SemanticClass
 
 _NORMALS_OF = 40
 """Neighbours of a normal: the original's."""

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import time
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import cast
 
@@ -45,7 +44,7 @@ class PeersConfig(Settings):
         frames: that the peers are given, evenly over the drive; the package's methods choose their own.
         samples: poses of each round of CalibAnything's random search; the original leaves it to its user.
         failed_deg, failed_m: rotation (QAD) or translation (ATD) beyond which a run has failed.
-        jobs: tasks at a time, a process each; a task is a method on a drive.
+        jobs: drives at a time, a process each.
         records: file that keeps finished tasks, from which a further call goes on.
         figure: SVG to write, of error against start.
         street: the rest of the streets.
@@ -152,8 +151,8 @@ _Solver = Callable[[gtsam.Pose3, float], _Answer]
 """From a start and the half width of its error [deg]."""
 
 
-def tasks_of(config: PeersConfig) -> list[PeerTask]:
-    """All tasks, drive by drive: streets, then folders.
+def tasks_of(config: PeersConfig) -> list[list[PeerTask]]:
+    """All tasks of each drive: streets, then folders.
 
     Streets and folders are numbered apart: more of the one leave the records of the other as they are.
     """
@@ -162,22 +161,25 @@ def tasks_of(config: PeersConfig) -> list[PeerTask]:
     places = [("", number) for number in range(config.streets)]
     places += [(place, number) for number, place in enumerate(config.data)]
     return [
-        PeerTask(place, number, method, own, traced=number == 0)
+        [PeerTask(place, number, method, own, number == 0) for method in (START, *config.methods)]
         for place, number in places
-        for method in (START, *config.methods)
     ]
 
 
-def runs_of_task(task: PeerTask) -> list[PeerRun]:
-    """A method from all starts on a drive.
+def runs_of(tasks: Sequence[PeerTask]) -> Iterator[list[PeerRun]]:
+    """Each method from all starts on one drive, which is read and prepared once.
 
     Raises:
         DataError: the drive cannot be used.
         ConfigError: it brings no reference calibration.
     """
+    read = _read(tasks[0])
+    for task in tasks:
+        yield _runs_of_task(task, read)
+
+
+def _runs_of_task(task: PeerTask, read: _ReadDrive) -> list[PeerRun]:
     config = task.config
-    # Tasks come drive by drive: the one that is read and prepared serves all of its methods.
-    read = _read(task.place, task.number, config)
     solve = None if task.method == START else _solver(read, task.method, config)
     rng = np.random.default_rng([config.seed, task.number, 25])
     found = []
@@ -207,12 +209,12 @@ class _ReadDrive:
     problem: PeerProblem
 
 
-@functools.lru_cache(maxsize=1)
-def _read(place: str, number: int, config: PeersConfig) -> _ReadDrive:
-    if place:
-        source = open_source(place, image_shift=config.image_shift)
+def _read(task: PeerTask) -> _ReadDrive:
+    config = task.config
+    if task.place:
+        source = open_source(task.place, image_shift=config.image_shift)
     else:
-        source = simulate(dataclasses.replace(config.street, seed=config.seed + number))
+        source = simulate(dataclasses.replace(config.street, seed=config.seed + task.number))
     truth = truth_of(source)
     swept = with_sweep(source, config.calibration.decide_sweep)
     drive = prepare_drive(swept, config.calibration.classes, config.calibration.prepare)

@@ -24,8 +24,7 @@ from scipy.optimize import minimize
 
 from sst_graph.errors import EstimationError
 from sst_graph.experiments.peers.frames import PeerFrame, PeerProblem, moved_by
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 _NID_BINS, _OUTER = 16, 10
 _INNER = 50

@@ -10,7 +10,7 @@ import numpy as np
 
 from sst_graph.drive.preparation import Progress
 from sst_graph.experiments.peers.methods import OWN, PEERS
-from sst_graph.experiments.peers.runs import START, PeerRun, PeersConfig, runs_of_task, tasks_of
+from sst_graph.experiments.peers.runs import START, PeerRun, PeersConfig, runs_of, tasks_of
 from sst_graph.experiments.resumable import Work, rows_of
 from sst_graph.files import atomic_write_bytes
 from sst_graph.viz.matplotlib_figure import figure_class
@@ -40,8 +40,7 @@ def run(config: PeersConfig, progress: Progress | None = None) -> str:
         MissingDependencyError: a figure is asked for, and matplotlib is not installed.
     """
     figure_of = figure_class() if config.figure else None
-    found = rows_of(Work(runs_of_task, PeerRun, config.jobs, config.records), tasks_of(config), progress)
-    runs = [row for rows in found for row in rows]
+    runs = rows_of(Work(runs_of, PeerRun, config.jobs, config.records), tasks_of(config), progress)
     if figure_of is not None:
         atomic_write_bytes(config.figure, figure(runs, config, figure_of))
     return markdown(runs, config)

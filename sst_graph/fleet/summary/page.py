@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
-from importlib.resources import files
 from itertools import pairwise
 from urllib.parse import quote
 
@@ -18,7 +17,7 @@ from sst_graph.fleet.vehicles.fused import Vehicle
 from sst_graph.inspect.inspection import HUMAN
 from sst_graph.inspect.reasons import cut
 from sst_graph.report.chart import Chart
-from sst_graph.report.html import bullets, details, figure, grid, paragraph, section, text
+from sst_graph.report.html import bullets, details, figure, grid, packaged, page, paragraph, section, text
 
 MOST_ROWS = 5000
 """Drives on the page; the tables have all of them. Those that need attention come first."""
@@ -48,18 +47,8 @@ def summary_html(
         _drives(rows),
     ]
     title = f"Batch of {count_of(len(rows), 'drive')}"
-    style = files("sst_graph.report").joinpath("page.css").read_text(encoding="utf-8")
-    own = files("sst_graph.fleet.summary")
-    script = own.joinpath("page.js").read_text(encoding="utf-8")
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        '<link rel="icon" href="data:,">\n'
-        f"<title>{text(title)}</title>\n<style>\n{style}{own.joinpath('page.css').read_text(encoding='utf-8')}"
-        f"</style>\n</head>\n<body>\n<h1>{text(title)}</h1>\n<main>\n"
-        + "\n".join(one for one in body if one)
-        + f"\n</main>\n<script>\n{script}</script>\n</body>\n</html>\n"
-    )
+    style, script = (packaged(name, "sst_graph.fleet.summary") for name in ("page.css", "page.js"))
+    return page(title, filter(None, body), style=packaged("page.css") + style, script=script)
 
 
 def counts_line(rows: Sequence[Row]) -> str:

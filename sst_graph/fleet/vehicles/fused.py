@@ -7,9 +7,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from sst_graph.covariance.observability import ObservabilityConfig, weak_directions
 from sst_graph.errors import EstimationError
 from sst_graph.factors.errors import FactorError
@@ -21,7 +18,6 @@ from sst_graph.fleet.vehicles.walk import DriveEstimate, Smoothed, WalkConfig, s
 from sst_graph.imports.records import VEHICLE_FORMAT
 from sst_graph.result import WeakDirection
 
-FloatArray = NDArray[np.float64]
 VehicleStatus = Literal["ok", "unobservable", "changed", "contradicted", "no_result"]
 
 _LIMITS = ObservabilityConfig()

@@ -17,14 +17,12 @@ from itertools import pairwise
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.config import Settings, setting
 from sst_graph.export import EXTRINSIC, TIME_OFFSET, CalibrationMarginal, marginal_of_graph
 from sst_graph.factors import extrinsic_drift, time_offset_drift
 from sst_graph.marginal import Separated, separated
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 _DAY_S = 86400.0
 _LEAST_DAYS = 1.0 / 24.0

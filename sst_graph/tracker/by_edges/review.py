@@ -14,7 +14,6 @@ from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.batch.by_edges.covariance import (
     FEW_OBJECTS,
@@ -45,9 +44,7 @@ from sst_graph.tracker.uncertainty import Uncertainty
 from sst_graph.tracker.window.matcher import WindowMatcher
 from sst_graph.tracker.window.smoother import WindowSmoother
 from sst_graph.tracker.window.window import Stretch
-from sst_graph.types import SemanticClass
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray, SemanticClass
 
 _SCANS = 12
 """Scans that scores are compared on."""

@@ -12,14 +12,11 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.association.edge_matching import MatchConfig, SilhouetteMatches
 from sst_graph.assumptions import held_at_zero
 from sst_graph.batch.by_edges.positions import POSITIONS, position_columns
-from sst_graph.types import SemanticClass
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray, SemanticClass
 
 SHIFTS = tuple(f"edges_shift_{axis}" for axis in range(7))
 """Shifts of extrinsic and time offset as all edges see them [rad, m, s]."""

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.association.edge_matching import SIDES, MatchConfig
 from sst_graph.covariance.error_model import SideResiduals
@@ -24,10 +23,7 @@ from sst_graph.objects.tracks import numbers_in, of_each
 from sst_graph.tracker.sums.held import EDGE_ERRORS, edge_error_columns
 from sst_graph.tracker.sums.object_sums import ObjectInformation
 from sst_graph.tracker.window.gaussian import Gaussian, Point
-from sst_graph.types import SemanticClass
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from sst_graph.types import FloatArray, IntArray, SemanticClass
 
 _LEAST_CURVATURE = 0.2
 """Least mean curvature, over the mean weight, in the observed information: it stays positive where most

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from sst_graph.covariance.jackknife import ObjectSpread, steps_without
 from sst_graph.tracker.window.gaussian import Gaussian, Point, core_steps
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.covariance.error_model import ErrorModel, SideResiduals, fit_error_model
 from sst_graph.covariance.jackknife import curvature_ratio
@@ -18,9 +17,7 @@ from sst_graph.covariance.sums import ScoreSums, total
 from sst_graph.tracker.sums.linearized_pair import LinearizedPair
 from sst_graph.tracker.sums.object_sums import ObjectSums
 from sst_graph.tracker.window.gaussian import with_room
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from sst_graph.types import FloatArray, IntArray
 
 _MEMORY = 50
 """A side that was not seen in so many scans is closed: objects are forgotten after as many."""

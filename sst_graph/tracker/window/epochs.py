@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.covariance.error_model import ErrorModel
 from sst_graph.covariance.jackknife import composed
@@ -14,9 +13,7 @@ from sst_graph.graph.matching import PairMatches
 from sst_graph.tracker.sums.linearized_pair import LinearizedPair
 from sst_graph.tracker.sums.running_sums import RunningSums
 from sst_graph.tracker.window.gaussian import Gaussian, Point
-from sst_graph.types import SemanticClass
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray, SemanticClass
 
 EPOCH_S = 1.0
 """One calibration is estimated for each epoch of this length; shorter ones cost more variables [s]."""

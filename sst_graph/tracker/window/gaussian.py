@@ -10,16 +10,12 @@ from itertools import pairwise
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.errors import EstimationError
 from sst_graph.factors import custom_factor
 from sst_graph.graph.linear import scaled_inverse, scattered
 from sst_graph.graph.state import State, lower_edge_track
-from sst_graph.types import SemanticClass
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from sst_graph.types import FloatArray, IntArray, SemanticClass
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.inspect.gained import Gain, Gained, bits_between
 from sst_graph.result import FrameId
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 MOST = 2000
 """Latest scans that are kept."""

@@ -11,7 +11,6 @@ from collections.abc import Collection, Container
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.batch.by_edges.optimum import CONVERGED_STEP
 from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX
@@ -22,8 +21,7 @@ from sst_graph.tracker.by_edges.kinds import by_edges
 from sst_graph.tracker.window.gaussian import Point, core_steps, inverted
 from sst_graph.tracker.window.matcher import WindowMatcher
 from sst_graph.tracker.window.smoother import WindowSmoother
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 _CONVERGED_SIGMAS = 0.02
 """A step of matching and solving that is shorter, in standard deviations, has converged."""

@@ -10,7 +10,6 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.association.edge_matching import SIDES
 from sst_graph.assumptions import ASSUMPTIONS, named_sigmas
@@ -34,9 +33,7 @@ from sst_graph.tracker.sums.running_sums import RunningSums
 from sst_graph.tracker.window.epochs import Epoch, EpochSums, MatchedPair, RetiredEpoch
 from sst_graph.tracker.window.gaussian import Gaussian, Point, insert_point, inverted
 from sst_graph.tracker.window.smoother_update import SmootherUpdate, TwistFactor, read_point
-from sst_graph.types import SemanticClass
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray, SemanticClass
 
 _RELINEARIZE = {
     "E": np.repeat([2e-4, 1e-3], 3),

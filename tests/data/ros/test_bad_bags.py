@@ -233,6 +233,6 @@ def test_without_rosbags_the_message_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = made(tmp_path, fill)
-    monkeypatch.setitem(sys.modules, "rosbags.rosbag1", None)
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
     with pytest.raises(MissingDependencyError, match=r"pip install 'sst-graph\[ros\]'"):
         open_source(path)

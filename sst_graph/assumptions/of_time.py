@@ -1,4 +1,4 @@
-"""The two clocks run at the same rate, and all rows of a picture are exposed at once."""
+"""Times are those of the stamps: clocks of one rate, rows exposed at once, no motion within a sweep."""
 
 from __future__ import annotations
 
@@ -38,4 +38,30 @@ LINE_DELAY = Assumption(
     prevalence=0.1,  # of the cameras on vehicles most have a global shutter
     violation="rows of the pictures are exposed one after the other (rolling shutter)",
     remedy="use a camera with a global shutter, or estimate it with --estimate line_delay",
+)
+
+
+def _sweep(view: View) -> Effect:
+    """The share of the sweep that is left: a point at azimuth a was measured a / (2 pi) of a turn away.
+
+    Clockwise from above, forward at the stamp: a point to the left comes before it. Where the points
+    have times, the share of them that is missing.
+    """
+    if view.offsets_s.any():
+        return Effect(time_s=-view.offsets_s)
+    azimuth = np.arctan2(view.lPs[:, 1], view.lPs[:, 0])
+    return Effect(time_s=azimuth / (2.0 * np.pi) * view.period_s)
+
+
+SWEEP = Assumption(
+    name="sweep",
+    unit="",
+    effect=_sweep,
+    sigma=0.03,
+    source="compensation with the odometry of the vehicle: 3 % of its speed",
+    span=1.0,
+    of_lidar=True,
+    violation="the clouds are not compensated as assumed (share of a clockwise sweep that is left)",
+    by_matches=False,
+    remedy="say how the clouds were made with --sweep, or give the time of each point",
 )

@@ -1,0 +1,109 @@
+"""The camera is the pinhole that is given: focal length, principal point, no distortion left in pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sst_graph.assumptions.model import Assumption, Effect, View
+
+
+def _focal(view: View) -> Effect:
+    """u - cx and v - cy grow by the same share."""
+    camera = view.camera
+    return Effect(pixel_shift=view.uvs - np.array([camera.cx, camera.cy]))
+
+
+FOCAL = Assumption(
+    name="focal",
+    unit="",
+    effect=_focal,
+    sigma=5e-4,
+    source="spread of repeated target calibrations: 0.3 px of 700 px",
+    span=0.05,
+    violation="the focal length does not fit the pictures (share by which it is too short)",
+    remedy="check that the camera matrix belongs to this camera, lens setting and image size",
+    by_edges=True,
+)
+
+
+def _right(view: View) -> Effect:
+    return Effect(pixel_shift=np.broadcast_to(np.array([1.0, 0.0]), view.uvs.shape))
+
+
+def _down(view: View) -> Effect:
+    return Effect(pixel_shift=np.broadcast_to(np.array([0.0, 1.0]), view.uvs.shape))
+
+
+_POINT_SOURCE = "spread of repeated target calibrations: 0.2 to 0.5 px"
+_POINT_PREVALENCE = 0.1
+"""A judgement: pictures are cropped, and matrices taken from another day or camera, about that often."""
+_POINT_REMEDY = "check that the camera matrix belongs to this image size and crop"
+
+CX = Assumption(
+    name="cx",
+    unit="px",
+    effect=_right,
+    sigma=0.3,
+    source=_POINT_SOURCE,
+    span=30.0,
+    violation="the pictures lie beside the principal point cx",
+    remedy=_POINT_REMEDY,
+    prevalence=_POINT_PREVALENCE,
+    by_edges=True,
+)
+CY = Assumption(
+    name="cy",
+    unit="px",
+    effect=_down,
+    sigma=0.3,
+    source=_POINT_SOURCE,
+    span=30.0,
+    violation="the pictures lie beside the principal point cy",
+    remedy=_POINT_REMEDY,
+    prevalence=_POINT_PREVALENCE,
+    by_edges=True,
+)
+
+
+def _radial(view: View, power: int) -> Effect:
+    """uv = c + f (x, y) (1 + k1 r^2 + k2 r^4), r^2 = x^2 + y^2 (Brown 1971; OpenCV's k1 and k2)."""
+    rays = view.rays
+    square = (rays**2).sum(axis=1, keepdims=True)
+    focal = np.array([view.camera.fx, view.camera.fy])
+    return Effect(pixel_shift=focal * rays * square**power)
+
+
+def _k1(view: View) -> Effect:
+    return _radial(view, 1)
+
+
+def _k2(view: View) -> Effect:
+    return _radial(view, 2)
+
+
+_DISTORTION_SOURCE = "what target calibrations leave in rectified pictures"
+_DISTORTION_VIOLATION = "the pictures look distorted"
+_DISTORTION_REMEDY = "undistort the pictures and masks, or give the camera's distortion"
+
+K1 = Assumption(
+    name="k1",
+    unit="",
+    effect=_k1,
+    sigma=1e-3,
+    source=_DISTORTION_SOURCE,
+    span=0.3,
+    prevalence=0.5,  # pictures come as they were taken about as often as undistorted
+    violation=_DISTORTION_VIOLATION,
+    remedy=_DISTORTION_REMEDY,
+    by_edges=True,
+)
+K2 = Assumption(
+    name="k2",
+    unit="",
+    effect=_k2,
+    sigma=1e-3,
+    source=_DISTORTION_SOURCE,
+    span=0.3,
+    violation=_DISTORTION_VIOLATION,
+    remedy=_DISTORTION_REMEDY,
+)
