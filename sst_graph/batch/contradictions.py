@@ -13,14 +13,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.batch.part_solver import Part, PartSolver, SolvedPart
 from sst_graph.covariance.contradiction import Difference, combined, name_step
 from sst_graph.graph.state import State
-
-FloatArray = NDArray[np.float64]
-
 
 FALSE_ALARM = 1e-3
 """Probability that any part of a calibration seems to contradict the rest where none does, as far as the

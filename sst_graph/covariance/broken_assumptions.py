@@ -22,9 +22,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 _SCALES = 24
 """Deviations of a broken assumption's parameter that the average runs over: a factor of 2 apart at most."""

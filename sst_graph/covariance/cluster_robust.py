@@ -21,7 +21,6 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.covariance.error_model import ErrorModel, fit_error_model
 from sst_graph.covariance.jackknife import ObjectSpread, composed, steps_without
@@ -31,8 +30,7 @@ from sst_graph.graph.elimination import Unknowns, marginal_covariance
 from sst_graph.graph.matching import PairMatches
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import ObjectId
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 
 @dataclass(frozen=True)

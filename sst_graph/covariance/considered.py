@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.assumptions import ASSUMPTIONS, held_at_zero, named_sigmas
 from sst_graph.config import Settings, setting
@@ -27,8 +26,7 @@ from sst_graph.graph.elimination import marginal_covariance
 from sst_graph.graph.matching import GraphConfig, PairMatches
 from sst_graph.graph.nuisances import residual_columns
 from sst_graph.graph.state import State, twist_key
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 BUDGET = "sigma_budget"
 """Key of :func:`budget` among a result's diagnostics."""

@@ -16,10 +16,9 @@ from itertools import combinations
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtrc
 
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 _LEAST_FREEDOM = 4.0
 """Least degrees of freedom of a covariance, however few clusters: part of it is the error model's."""

@@ -15,12 +15,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.association.edge_matching import SIDES
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from sst_graph.types import FloatArray, IntArray
 
 _SIDE, _SIDE_FRAME = 0.17, 0.17
 """Least variances as shares of a match's own: of a side over all frames, of a side in one frame.

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.covariance.cluster_robust import RobustCovariance
 from sst_graph.covariance.considered import columns_of, weighted_columns
@@ -28,9 +27,7 @@ from sst_graph.covariance.sums import summed_rows
 from sst_graph.covariance.undecided_sweep import MATTERS
 from sst_graph.graph.matching import PairMatches
 from sst_graph.graph.state import State
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from sst_graph.types import FloatArray, IntArray
 
 _LEAST_SIDES = 4
 """Fewest sides of objects in an image that its shift (2 numbers) is fitted to: with fewer, its variance

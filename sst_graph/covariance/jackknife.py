@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.graph.linear import unit_scale, with_ridge
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 
 @dataclass(frozen=True)

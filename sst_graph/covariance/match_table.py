@@ -8,7 +8,6 @@ from functools import cached_property
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import csr_array
 
@@ -23,10 +22,7 @@ from sst_graph.graph.elimination import Unknowns, twist_responses
 from sst_graph.graph.matching import PairMatches
 from sst_graph.graph.state import State, nuisance_key, time_offset_key, twist_key
 from sst_graph.objects.tracks import ObjectId
-from sst_graph.types import SemanticClass
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from sst_graph.types import FloatArray, IntArray, SemanticClass
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,10 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.config import Settings, setting
 from sst_graph.result import DIRECTION_SCALES, WeakDirection
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 _TAKES_PART = 0.1
 """Least part of a weak direction's unit vector that is named."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 FEWEST = 12
 """Fewest half-samples that a spread is believed of."""

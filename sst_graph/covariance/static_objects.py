@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from sst_graph.covariance.cluster_robust import RobustCovariance, covariance_of
 from sst_graph.covariance.sums import gram
 from sst_graph.graph.matching import PairMatches
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 _ALL = 1.0 - 1e-6
 """Largest share of the information on a direction that is taken away."""

@@ -21,14 +21,11 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from sst_graph.covariance.error_model import ErrorModel, by_side_and_frame
 from sst_graph.graph.linear import scattered
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from sst_graph.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True)

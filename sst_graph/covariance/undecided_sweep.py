@@ -6,11 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.odometry.sweep import REMEDY, SweepDecision
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 MATTERS = 0.5
 """An undecided sweep matters where it makes up more than this share of the sigma claimed for an unknown."""

@@ -11,13 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.config import Settings, setting
 from sst_graph.graph.matching import PairMatches
 from sst_graph.graph.state import State
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 
 @dataclass(frozen=True)

@@ -27,12 +27,11 @@ from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
 from sst_graph.odometry.sweep import SweepDecision, SweptSource
 from sst_graph.odometry.visual import ImagePair, next_pair
-from sst_graph.types import CameraImage, Frame, RelativeMotion, Scan, SemanticClass, Source
+from sst_graph.types import CameraImage, FloatArray, Frame, RelativeMotion, Scan, SemanticClass, Source
 from sst_graph.validation import checked_frame, checked_image, checked_scan
 
 _LOG = logging.getLogger(__name__)
 
-FloatArray = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 """Called with (stage, steps done, steps in all)."""
 

@@ -14,14 +14,12 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.drive.preparation import Drive, ScanFeatures
 from sst_graph.objects.occupancy import ObjectName, OccupancyTest
 from sst_graph.objects.tracks import ObjectId, object_centres, scan_poses
 from sst_graph.objects.velocity import ObjectVelocities, ObjectVelocity
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 _WINDOW_NS = 800_000_000
 """Half width of the time around a scan in which a track's centres are fitted [ns]."""

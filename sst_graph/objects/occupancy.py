@@ -18,9 +18,8 @@ from scipy.spatial import cKDTree
 
 from sst_graph.drive.preparation import ScanFeatures
 from sst_graph.odometry.lidar import MOVABLE_CLASSES
-from sst_graph.types import SemanticClass
+from sst_graph.types import FloatArray, SemanticClass
 
-FloatArray = NDArray[np.float64]
 ObjectName = tuple[SemanticClass, int]
 """Class of an object and its number within its scan."""
 

@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 from sst_graph.drive.preparation import Drive
 from sst_graph.features.lidar_edges import Boundaries
 from sst_graph.objects.occupancy import ObjectName
-from sst_graph.types import SemanticClass
+from sst_graph.types import FloatArray, IntArray, SemanticClass
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 ObjectId = tuple[int, SemanticClass, int]
 """Position of the scan, class, number of the object within the scan."""
 

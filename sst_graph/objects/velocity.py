@@ -13,16 +13,12 @@ from typing import ClassVar
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from sst_graph.drive.preparation import ScanFeatures
 from sst_graph.features.lidar_edges import Boundaries, Edge
 from sst_graph.objects.occupancy import TESTED_CLASSES, ObjectName
-from sst_graph.types import SemanticClass
-
-FloatArray = NDArray[np.float64]
-
+from sst_graph.types import FloatArray, SemanticClass
 
 _WINDOW_S = 0.35
 """Half width of the time around a scan in which the near end is followed [s]."""

@@ -7,9 +7,7 @@ import small_gicp
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
-from sst_graph.types import Scan
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray, Scan
 
 PARALLEL_COSINE = 0.9
 """Normals whose angle to the main normal has a larger cosine count as the same surface direction."""

@@ -9,9 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sst_graph.factors.camera import PinholeCamera
-
-FloatArray = NDArray[np.float64]
-
+from sst_graph.types import FloatArray
 
 _NEIGHBOURS = 8
 """Points from which a feature's depth is interpolated."""

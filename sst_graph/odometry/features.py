@@ -9,9 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
-from sst_graph.types import CameraImage, SemanticClass
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import CameraImage, FloatArray, SemanticClass
 
 UNTRACKED_CLASSES = (
     SemanticClass.VEHICLE,

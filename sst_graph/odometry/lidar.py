@@ -23,9 +23,7 @@ from sst_graph.odometry.cloud import (
 )
 from sst_graph.odometry.local_map import LocalMap, MappedCloud
 from sst_graph.odometry.static_points import StaticPoints
-from sst_graph.types import RelativeMotion, Scan, SemanticClass
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray, RelativeMotion, Scan, SemanticClass
 
 MOVABLE_CLASSES = (SemanticClass.VEHICLE, SemanticClass.PERSON, SemanticClass.TWO_WHEELER)
 """Classes whose members may move by themselves."""

@@ -6,16 +6,12 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.odometry.depth import RANGE_SIGMA, InverseDepths, inverse_depths
 from sst_graph.odometry.features import Tracks
 from sst_graph.odometry.relative import MIN_NOISE_PX, DirectionMotion, huber_weights, rays, skew
-from sst_graph.types import RelativeMotion
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from sst_graph.types import BoolArray, FloatArray, RelativeMotion
 
 MIN_SCALED_DEPTH = 1e-2
 """Points are kept at least this part of their depth in front of camera b."""

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 import small_gicp
-from numpy.typing import NDArray
 
 from sst_graph.errors import DataError, count_of
 from sst_graph.odometry.cloud import FEWEST_POINTS, registration_cloud, usable_points
@@ -27,9 +26,6 @@ from sst_graph.odometry.lidar import (
     registration_covariance,
 )
 from sst_graph.types import RelativeMotion, Scan
-
-FloatArray = NDArray[np.float64]
-
 
 _VOXEL_M = 0.3
 """Edge of the voxels of which one point is registered [m]."""

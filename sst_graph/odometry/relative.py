@@ -7,13 +7,10 @@ from dataclasses import dataclass
 import cv2
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.odometry.features import Tracks
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from sst_graph.types import BoolArray, FloatArray
 
 EPIPOLE_PX = 40.0
 """Tracks nearer to the epipole than this lose their weight [px]."""

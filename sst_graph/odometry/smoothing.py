@@ -20,12 +20,9 @@ from typing import ClassVar
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.odometry.standstill import overlap
-from sst_graph.types import RelativeMotion
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray, RelativeMotion
 
 _SHORTEST = 5
 """Fewest motions in a row that determine how smooth they are."""

@@ -9,9 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-
+from sst_graph.types import BoolArray, FloatArray
 
 _MEMORY_S = 0.6
 """Age of the scan with which an object is compared [s]: at 1 m/s it has left its place by four times

@@ -10,16 +10,12 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
-import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.odometry.features import FeatureTracker, Tracks
 from sst_graph.odometry.metric import metric_motion
 from sst_graph.odometry.relative import DirectionMotion, relative_pose
-from sst_graph.types import CameraImage, RelativeMotion
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import CameraImage, FloatArray, RelativeMotion
 
 DepthProvider = Callable[[int], FloatArray]
 """For the position of an image: (m, 3) LiDAR points in the camera at that image's instant [m]."""

@@ -88,7 +88,7 @@ def test_half_samples_that_both_cameras_have() -> None:
     objects = own - 2.0 * np.outer(step, step)
     matrix = joint_covariance([own, its], [one, other]).matrix
     np.testing.assert_allclose(matrix[:7, 7:], 2.0 * objects - np.outer(step, step), rtol=1e-4, atol=1e-9)
-    np.testing.assert_allclose(np.diag(objects), np.var(steps, axis=0, ddof=1) * 15.0 / 7.0)
+    np.testing.assert_allclose(np.diag(objects), np.mean(steps**2, axis=0) * 16.0 / 8.0)
     few = SharedErrors(np.where(np.arange(16)[:, None] < 17 - FEWEST, np.nan, steps), other.common)
     assert few.estimated == FEWEST - 1
     np.testing.assert_allclose(one.cross_covariance(few), -np.outer(step, step))

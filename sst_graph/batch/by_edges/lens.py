@@ -7,8 +7,7 @@ estimate over its deviation decides (Wald), by Student's t with one degree of fr
 half-samples.
 
 A lens that is contradicted is a reason against the estimate where it matters: where the estimate moves
-farther than it is known when the contradicted parameters are free. Where it moves less far, that step is
-added to the covariance.
+farther than it is known when the lens is free. Where it moves less far, that step is added to the covariance.
 
 An estimate by labels is tested, too, by edges of some of its frames: those know the principal point several
 times as well as the outlines of a few vehicles.
@@ -16,7 +15,6 @@ times as well as the outlines of a few vehicles.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -26,7 +24,12 @@ from sst_graph.assumptions import ASSUMPTIONS, named_sigmas
 from sst_graph.batch.assumption_tests import ParameterTest, few_objects_factor
 from sst_graph.batch.by_edges.covariance import half_sample_steps
 from sst_graph.batch.by_edges.optimum import START_KERNELS_PX
-from sst_graph.batch.by_edges.problem import LabelEstimate, edges_problem, problem_of_some_frames
+from sst_graph.batch.by_edges.problem import (
+    EdgesProblem,
+    LabelEstimate,
+    edges_problem,
+    problem_of_some_frames,
+)
 from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX, solution_steps
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.covariance.considered import AssumptionConfig
@@ -39,8 +42,6 @@ from sst_graph.graph.state import State, difference
 from sst_graph.objects.tracks import ObjectId
 from sst_graph.stepwise import Stepwise, run_to_end
 from sst_graph.types import FloatArray, Guess
-
-_LOG = logging.getLogger(__name__)
 
 MATTERS_SIGMAS = 2.0
 """A step longer than this many standard deviations, on any axis, is a reason against an estimate; one that is
@@ -66,8 +67,7 @@ class LensTest:
 
     Attributes:
         findings: the most contradicted first; none where nothing was tested.
-        step: (7,) from the estimate to that with the contradicted parameters free [rad, m, s]; None where
-            none is.
+        step: (7,) from the estimate to that with the lens free [rad, m, s].
     """
 
     findings: tuple[ParameterTest, ...] = ()
@@ -81,7 +81,9 @@ class LensTest:
     @property
     def covariance(self) -> FloatArray:
         """(7, 7) what a contradicted lens adds."""
-        return np.zeros((7, 7)) if self.step is None else np.outer(self.step, self.step)
+        if self.step is None or not self.contradicted:
+            return np.zeros((7, 7))
+        return np.outer(self.step, self.step)
 
     def reasons(self, covariance: FloatArray) -> tuple[str, ...]:
         """A sentence where a contradicted lens matters to an estimate of a covariance (7, 7)."""
@@ -93,24 +95,25 @@ class LensTest:
 
     def remarks(self, covariance: FloatArray) -> tuple[str, ...]:
         """A sentence where it is contradicted and does not matter."""
-        if self.step is None or self._matters(covariance):
+        if not self.contradicted or self._matters(covariance):
             return ()
+        assert self.step is not None
         figures = ", ".join(each.assumption.figure(each.value, each.sigma) for each in self.contradicted)
         degrees, metres = (float(np.linalg.norm(self.step[own])) for own in (slice(0, 3), slice(3, 6)))
         return (
-            f"the lens is a little off, and the sigmas cover it: {figures}; with these free the estimate "
-            f"moves by {np.degrees(degrees):.2f} deg, {100.0 * metres:.1f} cm and "
+            f"the lens is a little off, and the sigmas cover it: {figures}; with the lens free the "
+            f"estimate moves by {np.degrees(degrees):.2f} deg, {100.0 * metres:.1f} cm and "
             f"{1e3 * self.step[6]:+.1f} ms",
         )
 
     def _matters(self, covariance: FloatArray) -> bool:
-        if self.step is None:
+        if self.step is None or not self.contradicted:
             return False
         return bool((np.abs(self.step) > MATTERS_SIGMAS * np.sqrt(np.diag(covariance))).any())
 
 
 def lens_steps(
-    problem: JointProblem,
+    edges: EdgesProblem,
     state: State,
     objects: Sequence[Mapping[ObjectId, int]],
     config: AssumptionConfig,
@@ -118,16 +121,19 @@ def lens_steps(
     """Estimate the parameters of the lens that are held, and test them; step by step.
 
     Args:
-        problem: that was solved, with a prior that holds under any lens.
+        edges: the problem that was solved.
         state: its estimate.
         objects: tracks of each drive's objects.
     """
-    estimated = dict(named_sigmas(problem.config.graph.estimate))
+    problem = edges.whole
+    graph = problem.config.graph
+    estimated = dict(named_sigmas(graph.estimate))
     names = [name for name, each in ASSUMPTIONS.items() if each.by_edges and name not in estimated]
     if not config.test or not names:
         return LensTest()
-    # 1. All parameters free, and how far half-samples are from there.
-    free, start = _with_free(problem, state, names)
+    graph = replace(graph, estimate=(*graph.estimate, *names))
+    free = replace(problem, config=replace(problem.config, graph=graph))
+    start = replace(state, nuisances={**state.nuisances, **dict.fromkeys(names, 0.0)})
     try:
         wide = yield from solution_steps(free, start, START_KERNELS_PX)
         found = yield from _near(free, wide.state)
@@ -136,24 +142,12 @@ def lens_steps(
             found = yield from _near(free, start)
     except EstimationError:
         return LensTest()
-    _, steps = yield from half_sample_steps(free, found, objects)
+    # Half of the objects, and half of what else is known: but for chance, their optimum is that of the whole.
+    halves = replace(free, prior=edges.known.factor(0.5))
+    _, steps = yield from half_sample_steps(halves, found, objects)
     findings = [_finding(name, found.nuisances[name], steps[name], config.threshold) for name in names]
     known = sorted((each for each in findings if each is not None), key=lambda each: -each.score)
-    # 2. What those that are contradicted do to the estimate, the others held.
-    wrong = [each.assumption.name for each in known if each.contradicted]
-    if wrong and len(wrong) < len(names):
-        try:
-            found = yield from _near(*_with_free(problem, state, wrong))
-        except EstimationError:
-            _LOG.info("the lens: no solution with %s alone", ", ".join(wrong))
-    return LensTest(tuple(known), difference(state, found) if wrong else None)
-
-
-def _with_free(problem: JointProblem, state: State, names: Sequence[str]) -> tuple[JointProblem, State]:
-    """The problem with some more parameters as unknowns, and a state where they are 0."""
-    graph = replace(problem.config.graph, estimate=(*problem.config.graph.estimate, *names))
-    start = replace(state, nuisances={**state.nuisances, **dict.fromkeys(names, 0.0)})
-    return replace(problem, config=replace(problem.config, graph=graph)), start
+    return LensTest(tuple(known), difference(state, found))
 
 
 def _near(problem: JointProblem, start: State) -> Stepwise[State]:
@@ -198,5 +192,5 @@ def lens_beside_labels(problem: CalibrationProblem, state: State) -> tuple[Param
     clocks = tuple(offsets_s[: len(state.time_offsets_s)])
     held = State(state.cTl, clocks, nuisances=dict(state.nuisances))
     edges = edges_problem(calibration, None, LabelEstimate(held, True))
-    found = run_to_end(lens_steps(edges.with_any_lens, held, calibration.objects, problem.config.assumptions))
+    found = run_to_end(lens_steps(edges, held, calibration.objects, problem.config.assumptions))
     return tuple(each for each in found.findings if each.assumption.name in _BESIDE_LABELS)

@@ -60,7 +60,7 @@ def edges_method(
     solution = run_to_end(best_optimum_steps(problem, begin, restarts, progress))
     # 4. Covariance, with what halves of the objects disagree by, edges that are farther away, and the lens.
     estimate, assumptions = JointEstimate.of(solution, calibration.objects), calibration.config.assumptions
-    lens = run_to_end(lens_steps(problem.with_any_lens, solution.state, calibration.objects, assumptions))
+    lens = run_to_end(lens_steps(problem, solution.state, calibration.objects, assumptions))
     wider = solve_joint(problem.whole, solution.state, WIDER_KERNEL_PX)
     wider_step = difference(solution.state, wider.state)
     own = edges_covariance(problem.whole, estimate, calibration.objects, assumptions, lens.findings)

@@ -11,7 +11,6 @@ import gtsam
 import numpy as np
 
 from sst_graph.association.time_pairing import pair_by_time
-from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.batch.by_edges.parts import thinned
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.motion_factor import gaussian_factor
@@ -20,7 +19,6 @@ from sst_graph.drive.edges_of_frames import with_edges
 from sst_graph.drive.preparation import Drive, PrepareConfig, Progress
 from sst_graph.edges.search import KnownRotation, SearchRegion, angle_deg
 from sst_graph.errors import EstimationError
-from sst_graph.factors.camera import PinholeCamera
 from sst_graph.graph.matching import DriveEdges, Tracks, edges_of
 from sst_graph.graph.outer_loop import JointProblem
 from sst_graph.graph.state import State, difference
@@ -61,18 +59,9 @@ class KnownCalibration:
     state: State
     covariance: FloatArray
 
-    def factor(self) -> gtsam.NonlinearFactor:
-        """In the joint graph."""
-        return gaussian_factor(self.state, self.covariance)
-
-    def under_any_lens(self, camera: PinholeCamera) -> KnownCalibration:
-        """The same without what it says of the camera's pitch and yaw: visual odometry takes the principal
-        point as given, and one that is off turns what it says as it turns an estimate by edges."""
-        turns = np.zeros((6, 2))
-        turns[:2] = np.diag([ASSUMPTIONS["cy"].span / camera.fy, ASSUMPTIONS["cx"].span / camera.fx])
-        steps = np.zeros((7, 2))
-        steps[:6] = self.state.cTl.inverse().AdjointMap() @ turns
-        return replace(self, covariance=self.covariance + steps @ steps.T)
+    def factor(self, share: float = 1.0) -> gtsam.NonlinearFactor:
+        """In the joint graph, with a share of its information."""
+        return gaussian_factor(self.state, self.covariance / share)
 
 
 @dataclass(frozen=True)
@@ -92,12 +81,6 @@ class EdgesProblem:
     region: SearchRegion
     centre: State
     known: KnownCalibration
-
-    @property
-    def with_any_lens(self) -> JointProblem:
-        """All scans, for a solution with the lens free."""
-        known = self.known.under_any_lens(self.whole.drives[0].camera)
-        return replace(self.whole, prior=known.factor())
 
     @cached_property
     def subset_edges(self) -> list[DriveEdges]:

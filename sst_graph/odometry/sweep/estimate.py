@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.odometry.sweep.window import ANNEALING, SECTORS, Normal, SurfaceSums, Window
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 _MAX_FRACTION = 1.3
 """Bound of the share on the way to an estimate: the truth is at most 1."""

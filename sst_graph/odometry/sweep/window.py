@@ -24,9 +24,8 @@ from sst_graph.odometry.cloud import compensate_sweep, usable_points
 from sst_graph.odometry.lidar import MOVABLE_CLASSES, LidarOdometry, orthonormal
 from sst_graph.odometry.static_points import on_static_objects
 from sst_graph.sweep_timing import turned
-from sst_graph.types import Scan
+from sst_graph.types import FloatArray, Scan
 
-FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.intp]
 
 SECTORS = 72

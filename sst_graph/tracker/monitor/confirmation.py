@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 DETECTABLE_TURN_RAD = float(np.radians(0.25))
 """Frames confirm the estimate where a turn of the camera by this about its x or y axis would be past the

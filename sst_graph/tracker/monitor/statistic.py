@@ -13,8 +13,7 @@ from sst_graph.covariance.error_model import ErrorModel
 from sst_graph.covariance.sums import ScoreSums, total
 from sst_graph.tracker.sums.linearized_pair import LinearizedPair
 from sst_graph.tracker.window.gaussian import Point
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 FRAMES = 4
 """New frames that are compared together: with fewer a turn hardly shows, with more the alarm is later."""

@@ -13,11 +13,9 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.tracker.window.gaussian import Point
-
-FloatArray = NDArray[np.float64]
+from sst_graph.types import FloatArray
 
 _FRAMES = 8
 """Held-out frames in a row that must meet the pictures better at a turned pose."""

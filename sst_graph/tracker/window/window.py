@@ -8,7 +8,6 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.batch.by_edges.parts import thinned_scan
 from sst_graph.batch.by_edges.problem import POINTS_A_SCAN
@@ -21,8 +20,6 @@ from sst_graph.objects.tracks import ObjectId, ObjectTracker
 from sst_graph.odometry.visual import ImagePair
 from sst_graph.tracker.by_edges.kinds import both_kinds, by_edges, by_labels
 from sst_graph.types import RelativeMotion, SemanticClass
-
-FloatArray = NDArray[np.float64]
 
 FARTHEST_NS = 86_400 * 10**9
 """A stamp that is farther ahead of the one before is an error, not a pause: a day [ns]."""
