@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from sst_graph.assumptions.model import Assumption, Effect, View
@@ -34,35 +36,20 @@ def _down(view: View) -> Effect:
     return Effect(pixel_shift=np.broadcast_to(np.array([0.0, 1.0]), view.uvs.shape))
 
 
-_POINT_SOURCE = "spread of repeated target calibrations: 0.2 to 0.5 px"
-_POINT_PREVALENCE = 0.1
-"""A judgement: pictures are cropped, and matrices taken from another day or camera, about that often."""
-_POINT_REMEDY = "check that the camera matrix belongs to this image size and crop"
-
 CX = Assumption(
     name="cx",
     unit="px",
     effect=_right,
     sigma=0.3,
-    source=_POINT_SOURCE,
+    source="spread of repeated target calibrations: 0.2 to 0.5 px",
     span=30.0,
     violation="the pictures lie beside the principal point cx",
-    remedy=_POINT_REMEDY,
-    prevalence=_POINT_PREVALENCE,
+    remedy="check that the camera matrix belongs to this image size and crop",
+    # A judgement: pictures are cropped, and matrices taken from another day or camera, about that often.
+    prevalence=0.1,
     by_edges=True,
 )
-CY = Assumption(
-    name="cy",
-    unit="px",
-    effect=_down,
-    sigma=0.3,
-    source=_POINT_SOURCE,
-    span=30.0,
-    violation="the pictures lie beside the principal point cy",
-    remedy=_POINT_REMEDY,
-    prevalence=_POINT_PREVALENCE,
-    by_edges=True,
-)
+CY = replace(CX, name="cy", effect=_down, violation="the pictures lie beside the principal point cy")
 
 
 def _radial(view: View, power: int) -> Effect:
@@ -81,29 +68,16 @@ def _k2(view: View) -> Effect:
     return _radial(view, 2)
 
 
-_DISTORTION_SOURCE = "what target calibrations leave in rectified pictures"
-_DISTORTION_VIOLATION = "the pictures look distorted"
-_DISTORTION_REMEDY = "undistort the pictures and masks, or give the camera's distortion"
-
 K1 = Assumption(
     name="k1",
     unit="",
     effect=_k1,
     sigma=1e-3,
-    source=_DISTORTION_SOURCE,
+    source="what target calibrations leave in rectified pictures",
     span=0.3,
+    violation="the pictures look distorted",
+    remedy="undistort the pictures and masks, or give the camera's distortion",
     prevalence=0.5,  # pictures come as they were taken about as often as undistorted
-    violation=_DISTORTION_VIOLATION,
-    remedy=_DISTORTION_REMEDY,
     by_edges=True,
 )
-K2 = Assumption(
-    name="k2",
-    unit="",
-    effect=_k2,
-    sigma=1e-3,
-    source=_DISTORTION_SOURCE,
-    span=0.3,
-    violation=_DISTORTION_VIOLATION,
-    remedy=_DISTORTION_REMEDY,
-)
+K2 = replace(K1, name="k2", effect=_k2, prevalence=0.02, by_edges=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from sst_graph.assumptions import held_at_zero
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.diagnosis import (
@@ -65,8 +66,8 @@ def with_causes(
 
 def _relies_on_principal_point(assumptions: AssumptionConfig) -> bool:
     """Whether it is neither estimated nor said how far it may be off."""
-    usual, estimated = AssumptionConfig(), dict(assumptions.estimated)
-    return not any(name in estimated or assumptions.sigma(name) > usual.sigma(name) for name in ("cx", "cy"))
+    usual, held = AssumptionConfig(), held_at_zero(assumptions.estimate)
+    return all(name in held and assumptions.sigma(name) <= usual.sigma(name) for name in ("cx", "cy"))
 
 
 def _suspected(
