@@ -17,7 +17,7 @@ from streets import TRACKED_STREET
 from sst_graph import CalibrationConfig, open_source
 from sst_graph.batch.calibrate import calibrate_prepared, prepare_drives
 from sst_graph.batch.contradictions import find_contradictions
-from sst_graph.batch.motion_factor import fuse_motion
+from sst_graph.batch.motion_factor import MAX_DISAGREEMENT_CHI2, fuse_motion
 from sst_graph.batch.part_solver import Part, PartSolver, SolvedPart
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.config import with_overrides
@@ -273,6 +273,27 @@ def test_motion_that_contradicts_a_stretch_is_left_out() -> None:
         assert (found.estimate is labels) is not used
         assert bool(found.remarks) is not used
     assert "frames 4 to 7" in found.remarks[0]
+
+
+def test_motion_that_does_not_fit_itself_contradicts_nothing() -> None:
+    (drive,) = prepared()
+    rng = np.random.default_rng(0)
+    astray = [
+        replace(pair, direction=replace(pair.direction, rotation=turned(pair.direction.rotation, rng)))
+        for pair in drive.image_pairs
+    ]
+    parts = parts_of([replace(drive, image_pairs=tuple(astray))])
+    solution = solve_joint(replace(parts.problem.joint(), config=JointConfig()), parts.reference, (5.0, 3.0))
+    labels = JointEstimate.of(solution, parts.problem.objects)
+    found = fuse_motion(parts.problem, labels, [])
+    assert found.diagnostics["chi2_of_7"] > MAX_DISAGREEMENT_CHI2
+    assert found.estimate is labels and not found.reasons
+    assert "times worse than their noise" in found.remarks[0]
+
+
+def turned(rotation: gtsam.Rot3, rng: np.random.Generator) -> gtsam.Rot3:
+    """By 0.3 deg (one sigma) about each axis."""
+    return rotation.compose(gtsam.Rot3.Expmap(np.radians(0.3) * rng.standard_normal(3)))
 
 
 @pytest.mark.slow
