@@ -1,7 +1,7 @@
 """Reasons of a result in one short line each: what is wrong, and what to do about it.
 
-A reason is a sentence of clauses, "what: figures: remedy". A terminal shows the first and the last one; the
-report shows all.
+A reason is a sentence of clauses, "what: figures; remedy". A terminal shows a long one by its first and its
+last clause; the report shows all.
 """
 
 from __future__ import annotations
@@ -22,10 +22,11 @@ def short_reasons(result: CalibrationResult) -> tuple[str, ...]:
 
 
 def short_reason(reason: str) -> str:
-    """What is wrong and what to do, without figures in parentheses and what stands between."""
-    clauses = [
-        clause.strip() for clause in _BREAK.split(_PARENTHESES.sub("", " ".join(reason.split()).rstrip(".")))
-    ]
+    """What is wrong and what to do: without what stands in parentheses, and, of a long sentence, between."""
+    whole = _PARENTHESES.sub("", " ".join(reason.split()).rstrip("."))
+    if len(whole) <= MOST_LETTERS:
+        return whole
+    clauses = [clause.strip() for clause in _BREAK.split(whole)]
     name = clauses.pop(0) + ": " if len(clauses) > 1 and " " not in clauses[0] else ""
     what, *rest = clauses
     what = what.split(";")[0].strip()

@@ -110,11 +110,23 @@ def test_names_keep_their_letters() -> None:
     ("reason", "short"),
     [
         (
-            "the LiDAR shifted forward cannot be distinguished from the image taken later: 1 m equals "
-            "91 ms of "
-            "time offset (one sigma: 13.9 cm, 12.7 ms): record a stop, a change of speed or a turn",
-            "the LiDAR shifted forward cannot be distinguished from the image taken later: record a stop, a "
-            "change of speed or a turn",
+            "the LiDAR shifted forward cannot be distinguished from the image taken later: 1 m equals 91 ms "
+            "of time offset (one sigma: 13.9 cm, 12.7 ms): record a stop, a change of speed or a turn",
+            "the LiDAR shifted forward cannot be distinguished from the image taken later: 1 m equals 91 ms "
+            "of time offset: record a stop, a change of speed or a turn",
+        ),
+        (
+            "the pictures lie beside the principal point cx: cx = 1.74 ± 0.46 px; check that the camera "
+            "matrix belongs to this image size and crop",
+            "the pictures lie beside the principal point cx: cx = 1.74 ± 0.46 px; check that the camera "
+            "matrix belongs to this image size and crop",
+        ),
+        (
+            "a/00: frames 0 to 29 and those from 30 on contradict each other: the later ones differ in "
+            "translation by 3.1 cm ± 0.4 cm backward; check whether the mount was moved, and calibrate the "
+            "frames before and after apart",
+            "a/00: frames 0 to 29 and those from 30 on contradict each other: check whether the mount was "
+            "moved, and calibrate the frames before and after apart",
         ),
         (
             "only 15 % of the boundary points in view meet a contour (expected 20 % or more): the pose "
