@@ -120,6 +120,14 @@ class Assumption:
     by_edges: bool = False
     of_lidar: bool = False
 
+    def contradicted_by(self, value: float, sigma: float, threshold: float) -> bool:
+        """Whether an estimate with its deviation is so many deviations from zero.
+
+        Never where the span itself would not be: no value that may be is told from zero then, and one that
+        seems to be is the sign of another error.
+        """
+        return abs(value) > threshold * sigma and threshold * sigma < self.span
+
     def figure(self, value: float, sigma: float) -> str:
         """The parameter's estimate with deviation and unit, as text."""
         unit = f" {self.unit}" if self.unit else ""

@@ -65,6 +65,11 @@ class ParameterTest:
     sigma: float
     contradicted: bool
 
+    @classmethod
+    def of(cls, assumption: Assumption, value: float, sigma: float, threshold: float) -> ParameterTest:
+        """The test of an estimate and its deviation."""
+        return cls(assumption, value, sigma, assumption.contradicted_by(value, sigma, threshold))
+
     def __getstate__(self) -> dict[str, Any]:
         """The assumption by its name: its effect is a function, which cannot be stored."""
         return {**vars(self), "assumption": self.assumption.name}
@@ -196,7 +201,7 @@ class LinearProblem:
         sigma = float(np.sqrt(covariance[place, place]))
         sigma *= few_objects_factor(int(table.objects.max()) + 1, config.threshold)
         value = self.values[name] + float(step[column])
-        return ParameterTest(ASSUMPTIONS[name], value, sigma, abs(value) > config.threshold * sigma)
+        return ParameterTest.of(ASSUMPTIONS[name], value, sigma, config.threshold)
 
     def start_of(self, finding: ParameterTest) -> State:
         """Predicted state of a solution with a finding's parameter alone."""
@@ -253,7 +258,7 @@ def _solved_alone(
     value, sigma = solution.state.nuisances[name], float(np.sqrt(robust.matrix[column, column]))
     sigma *= few_objects_factor(int(robust.table.objects.max()) + 1, config.threshold)
     alike = abs(value - finding.value) < config.threshold * max(sigma, finding.sigma)
-    same = alike and abs(value) > config.threshold * sigma
+    same = alike and finding.assumption.contradicted_by(value, sigma, config.threshold)
     return replace(finding, value=value, sigma=sigma) if same else finding
 
 
@@ -274,7 +279,7 @@ def with_further_tests(
         weights = np.array([each.sigma**-2.0 for each in both])
         value = float(weights @ [each.value for each in both] / weights.sum())
         sigma = float(weights.sum() ** -0.5)
-        if abs(value) > threshold * sigma:
+        if other.assumption.contradicted_by(value, sigma, threshold):
             found[name] = ParameterTest(other.assumption, value, sigma, True)
     return tuple(sorted(found.values(), key=lambda each: -each.score))
 

@@ -54,6 +54,5 @@ def score_findings(smoother: WindowSmoother, config: AssumptionConfig) -> tuple[
         if assumption is None or not assumption.by_matches:
             continue
         value, sigma = float(values[place]), float(sigmas[place])
-        contradicted = abs(value) > config.threshold * sigma
-        found.append(ParameterTest(assumption, value, sigma, contradicted))
+        found.append(ParameterTest.of(assumption, value, sigma, config.threshold))
     return tuple(sorted(found, key=lambda finding: -finding.score))

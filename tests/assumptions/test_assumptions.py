@@ -119,3 +119,10 @@ def test_every_assumption_has_violation_remedy_and_source(name: str) -> None:
     assert assumption.name == name and assumption.violation and assumption.remedy and assumption.source
     assert 0.0 < assumption.sigma < assumption.span
     assert assumption.figure(0.01234, 0.004).startswith(f"{name} = 0.0123 ± 0.004")
+
+
+def test_an_estimate_contradicts_only_where_a_value_that_may_be_would() -> None:
+    bias = ASSUMPTIONS["range_bias"]
+    assert bias.contradicted_by(0.1, 0.02, 3.3) and bias.contradicted_by(-1.0, 0.15, 3.3)
+    assert not bias.contradicted_by(0.1, 0.04, 3.3)
+    assert not bias.contradicted_by(-1.56, 0.45, 3.3)

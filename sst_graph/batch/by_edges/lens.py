@@ -173,7 +173,7 @@ def _finding(name: str, value: float, steps: FloatArray, threshold: float) -> Pa
     if len(known) < FEWEST:
         return None
     sigma = max(float(np.sqrt(np.mean(known**2))), 1e-12) * few_objects_factor(len(known), threshold)
-    return ParameterTest(ASSUMPTIONS[name], value, sigma, abs(value) > threshold * sigma)
+    return ParameterTest.of(ASSUMPTIONS[name], value, sigma, threshold)
 
 
 def lens_beside_labels(problem: CalibrationProblem, state: State) -> tuple[ParameterTest, ...]:
