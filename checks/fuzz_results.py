@@ -111,7 +111,7 @@ def batch(folder: Path, drive: Path, path: Path) -> None:
         drives = with_vehicles(find_drives(str(path)), str(folder / BATCH / "list.csv"))
         json.dumps([one.day for one in drives])
         return
-    record = Record.from_json(path.read_bytes(), path)
+    record = Record.from_json(Place.of(path).read(), path)
     records = {name: dataclasses.replace(record, drive=name) for name in ("a", "b")}
     drives = [
         Drive(name, Place.of(f"/drives/{name}"), "v", f"2026-01-0{k + 1}") for k, name in enumerate(records)

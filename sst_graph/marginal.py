@@ -331,9 +331,12 @@ def weighted_steps(parts: Sequence[Separated]) -> dict[str, FloatArray]:
 
 def own_covariance(covariance: FloatArray, errors: Mapping[str, FloatArray]) -> FloatArray | None:
     """(7, 7) part of a covariance without common errors, or None where that is none."""
-    own = covariance - _covariance_by(errors)
-    scale = 1.0 / np.sqrt(np.diag(covariance))
-    return own if np.linalg.eigvalsh(own * np.outer(scale, scale))[0] > _LEAST_OWN else None
+    with np.errstate(over="ignore", invalid="ignore"):
+        own = covariance - _covariance_by(errors)
+        unit = _scaled(own, np.diag(covariance))
+    if not np.isfinite(unit).all() or np.linalg.eigvalsh(unit)[0] <= _LEAST_OWN:
+        return None
+    return own
 
 
 _LEAST_OWN = 1e-9
@@ -500,11 +503,20 @@ def inverse(matrix: FloatArray, what: str) -> FloatArray:
     variances = np.diag(matrix)
     if not (variances > 0.0).all():
         raise EstimationError(f"{what}: found {variances.min():.3g} on the diagonal, expected above 0")
-    scale = 1.0 / np.sqrt(variances)
-    values, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
+    with np.errstate(over="ignore", invalid="ignore"):
+        unit = _scaled(matrix, variances)
+    if not np.isfinite(unit).all():
+        raise EstimationError(f"{what}: found entries far above those on the diagonal, expected an inverse")
+    values, vectors = np.linalg.eigh(unit)
     if values[0] < 1e-13:
         raise EstimationError(f"{what}: found a singular matrix ({values[0]:.1e}), expected an inverse")
-    return np.asarray(((vectors / values) @ vectors.T) * np.outer(scale, scale))
+    return _scaled((vectors / values) @ vectors.T, variances)
+
+
+def _scaled(matrix: FloatArray, variances: FloatArray) -> FloatArray:
+    """A matrix divided by the roots of variances on both sides."""
+    scale = 1.0 / np.sqrt(variances)
+    return np.asarray(matrix * np.outer(scale, scale))
 
 
 def _variable(name: str, key: int, kind: str, dim: int) -> dict[str, Any]:

@@ -256,7 +256,7 @@ class CalibrationResult:
             return CalibrationResult(
                 T_camera_lidar=reader.pose("T_camera_lidar"),
                 time_offset_s=reader.time_offset_s("time_offset_s"),
-                covariance=_covariance(reader),
+                covariance=reader.covariance("covariance", 7),
                 status=cast(Status, reader.text("status")),
                 camera=_camera(camera),
                 camera_name=camera.text("name"),
@@ -337,12 +337,6 @@ def _weak_direction(table: JsonTable) -> WeakDirection:
         table.sentence("sentence"),
         table.sentence("advice"),
     )
-
-
-def _covariance(table: JsonTable) -> FloatArray:
-    covariance = table.matrix("covariance", (7, 7))
-    check_covariance(f"{table.place}: covariance", covariance)
-    return covariance
 
 
 def _versions(table: JsonTable) -> dict[str, str]:

@@ -12,7 +12,13 @@ import gtsam
 import numpy as np
 
 from sst_graph.errors import DataError, printable
-from sst_graph.files.checked_values import check_finite, checked_pose, checked_text, checked_time_offset_s
+from sst_graph.files.checked_values import (
+    check_covariance,
+    check_finite,
+    checked_pose,
+    checked_text,
+    checked_time_offset_s,
+)
 from sst_graph.types import FloatArray
 
 MAX_SENTENCE = 4000
@@ -109,6 +115,12 @@ class JsonTable:
             raise DataError(self._at(key), "no numeric array", f"shape {shape}") from None
         check_finite(self._at(key), array, shape)
         return array
+
+    def covariance(self, key: str, size: int) -> FloatArray:
+        """A covariance (size, size) with sane sigmas."""
+        found = self.matrix(key, (size, size))
+        check_covariance(self._at(key), found)
+        return found
 
     def pose(self, key: str) -> gtsam.Pose3:
         """A rigid transform (4, 4)."""

@@ -17,10 +17,12 @@ from typing import Any
 
 from sst_graph.errors import DataError, MissingDependencyError, SstGraphError, one_line
 from sst_graph.files import MANIFEST, atomic_write_bytes
+from sst_graph.files.reading import FileKind, read_file
 
 _URL = re.compile(r"^[a-z][a-z0-9+.-]*://", re.IGNORECASE)
 _AT_ONCE = 1000
 """Small files that are read in one request for many."""
+_SMALL = FileKind("a list of drives or a file of a batch", 64 * 1024 * 1024)
 
 
 @dataclass(frozen=True)
@@ -122,7 +124,7 @@ class Place:
         """
         with _asked(self):
             if self.is_local:
-                return self.path.read_bytes()
+                return read_file(self.path, _SMALL)
             return bytes(self._system().cat_file(self.url))
 
     def write(self, data: bytes) -> None:
@@ -212,12 +214,8 @@ def read_many(places: Iterable[Place]) -> dict[Place, bytes]:
     if listed[0].is_local:
         found = {}
         for place in listed:
-            try:
-                found[place] = place.path.read_bytes()
-            except FileNotFoundError:
-                continue
-            except OSError as error:
-                raise DataError(place.url, str(error.strerror), "a file that can be read") from error
+            if place.exists():
+                found[place] = place.read()
         return found
     found = {}
     for start in range(0, len(listed), _AT_ONCE):

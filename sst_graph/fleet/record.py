@@ -177,7 +177,7 @@ class Record:
             numbers = Numbers(
                 read.pose("T_camera_lidar").matrix().tolist(),
                 read.time_offset_s("time_offset_s"),
-                read.matrix("covariance", (7, 7)).tolist(),
+                read.covariance("covariance", 7).tolist(),
                 {name: step.tolist() for name, step in steps_in(read).items()},
                 read.integer("frames"),
                 read.text("camera"),

@@ -141,8 +141,7 @@ class RigResult:
         names = _names(table)
         if sorted(names) != sorted(cameras):
             raise DataError(place, f"cameras {', '.join(names)}", f"those given: {', '.join(cameras)}")
-        covariance = table.matrix("covariance", (7 * len(names),) * 2)
-        check_covariance(f"{place}: covariance", covariance)
+        covariance = table.covariance("covariance", 7 * len(names))
         for i, name in enumerate(names):
             block = covariance[7 * i : 7 * i + 7, 7 * i : 7 * i + 7]
             own = cameras[name].covariance

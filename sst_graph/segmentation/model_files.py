@@ -97,6 +97,10 @@ def model_files(model: str | Path) -> tuple[Path, ...]:
     return (path, network, *weights_beside(network))
 
 
+_LARGEST_INPUT = 1e6
+"""Largest value of a pixel that a network for pictures is given: those of real ones are below 256."""
+
+
 def image_model(path: Path, table: Mapping[str, Any]) -> ImageModel:
     """What the table of a YAML file says of a network for pictures.
 
@@ -115,6 +119,9 @@ def image_model(path: Path, table: Mapping[str, Any]) -> ImageModel:
         std=_triple(table, "std", default.std, path, positive=True),
         layout=_choice(table, "layout", ("nchw", "nhwc"), path),
     )
+    if not values.largest <= _LARGEST_INPUT:
+        found = f"a value of {values.largest:.3g} in range, mean, std or what they make of a pixel"
+        raise DataError(path, found, f"at most {_LARGEST_INPUT:g}")
     return ImageModel(
         path=path,
         network=path.parent / _text(table, "network", path),

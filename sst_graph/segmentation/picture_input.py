@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.types import FloatArray
+
 Resize = Literal["stretch", "letterbox"]
 Channels = Literal["rgb", "bgr"]
 Layout = Literal["nchw", "nhwc"]
@@ -40,9 +42,19 @@ class PictureInput:
     @property
     def keeps_pixels(self) -> bool:
         """Whether the values are the pixels themselves, 0 to 255."""
-        black_and_white = np.array([[0.0], [255.0]])
-        values = (black_and_white / self.range - np.array(self.mean)) / np.array(self.std)
-        return bool((np.rint(values) == black_and_white).all())
+        return bool((np.rint(self._black_and_white) == [[0.0], [255.0]]).all())
+
+    @property
+    def largest(self) -> float:
+        """Largest absolute value of a pixel, and of what it is made with."""
+        return float(np.abs([*self._black_and_white, self.mean, self.std, [self.range] * 3]).max())
+
+    @property
+    def _black_and_white(self) -> FloatArray:
+        """(2, 3) values of a black and of a white pixel by channel."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            scaled = np.array([[0.0], [255.0]]) / self.range
+            return np.asarray((scaled - np.array(self.mean)) / np.array(self.std))
 
     def place(self, width: int, height: int) -> Placement:
         """Where a picture of a size [px] lies in the input."""

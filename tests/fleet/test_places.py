@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import uuid
 from pathlib import Path
 
@@ -88,3 +89,14 @@ def test_scratch_folders_of_ended_processes_are_removed(
         assert sweep_scratch() == 1
         assert sorted(one.name for one in tmp_path.iterdir()) == sorted(["of-others", own.name])
     assert [one.name for one in tmp_path.iterdir()] == ["of-others"]
+
+
+def test_what_is_no_file_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    for name, found in {"fifo": "a FIFO", ".": "a folder"}.items():
+        place = Place.of(tmp_path / name)
+        with pytest.raises(DataError, match=found):
+            place.read()
+        with pytest.raises(DataError, match=found):
+            read_many([place])
+    assert read_many([Place.of(tmp_path / "nothing")]) == {}

@@ -18,7 +18,7 @@ from fleet.vehicle_drives import RIG, SIGMAS
 from sst_graph import report
 from sst_graph.errors import DataError
 from sst_graph.export import fuse_marginals, marginal_of_result
-from sst_graph.factors import PinholeCamera
+from sst_graph.factors import FactorError, PinholeCamera
 from sst_graph.fleet import BatchConfig, Drive, Place, Record, write_summary
 from sst_graph.fleet.record import Cost, Numbers, Status
 from sst_graph.fleet.summary import page as summary_page
@@ -315,6 +315,28 @@ def test_a_record_that_is_none(changed: dict[str, object]) -> None:
     document = json.loads(done("x", result(1)).to_json()) | changed
     with pytest.raises(DataError, match=r"record\.json"):
         Record.from_json(json.dumps(document).encode(), "record.json")
+
+
+@pytest.mark.parametrize(
+    ("i", "j", "value", "found"),
+    [(0, 0, -1e-6, "a variance of -1e-06"), (0, 1, 1.0, "a correlation of"), (2, 5, 1e-3, "symmetric")],
+)
+def test_a_record_of_another_matrix_than_a_covariance(i: int, j: int, value: float, found: str) -> None:
+    document = json.loads(done("x", result(1)).to_json())
+    document["numbers"]["covariance"][i][j] = value
+    if found != "symmetric":
+        document["numbers"]["covariance"][j][i] = value
+    with pytest.raises(DataError, match=f"covariance: .*{found}"):
+        Record.from_json(json.dumps(document).encode(), "record.json")
+
+
+def test_a_record_with_common_errors_beyond_all_bounds() -> None:
+    document = json.loads(done("x", result(1)).to_json())
+    document["numbers"]["common_errors"] = {"cx": [1e200] * 7}
+    record = Record.from_json(json.dumps(document).encode(), "record.json")
+    assert record.numbers is not None
+    with pytest.raises(FactorError, match="more than its covariance"):
+        record.numbers.marginal()
 
 
 def test_the_pose_in_the_table_is_that_of_the_result(tmp_path: Path) -> None:

@@ -164,6 +164,10 @@ BAD_IMAGE_MODELS: dict[str, tuple[Made, str]] = {
         described("network: n.onnx\nclasses: coco\nstd: [1, 0, 1]\n"),
         "std: found 0, expected positive numbers",
     ),
+    "a range that is none": (
+        described("network: n.onnx\nclasses: coco\nrange: 1.0e-300\n"),
+        "found a value of 1.14e+303 in range, mean, std or what they make of a pixel, expected at most 1e+06",
+    ),
     "a width of -1": (
         described("network: n.onnx\nclasses: coco\nwidth: -1\n"),
         "width: found -1, expected 1 to",
