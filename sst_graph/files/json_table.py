@@ -70,7 +70,11 @@ class JsonTable:
         return number
 
     def integer(self, key: str) -> int:
-        return int(self._typed(key, int, "a whole number"))
+        """A whole number of 64 bits."""
+        found = int(self._typed(key, int, "a whole number"))
+        if not -(2**63) <= found < 2**63:
+            raise DataError(self._at(key), f"{found:.3g}", "a whole number of 64 bits")
+        return found
 
     def text(self, key: str, default: Any = _REQUIRED) -> str:
         """Text without control characters."""

@@ -317,6 +317,13 @@ def test_a_record_that_is_none(changed: dict[str, object]) -> None:
         Record.from_json(json.dumps(document).encode(), "record.json")
 
 
+def test_a_record_with_a_number_beyond_64_bits() -> None:
+    document = json.loads(done("x", result(1)).to_json())
+    document["cost"]["peak_bytes"] = 2**63
+    with pytest.raises(DataError, match=r"cost: peak_bytes: found 9.22e\+18, expected a whole number of 64"):
+        Record.from_json(json.dumps(document).encode(), "record.json")
+
+
 @pytest.mark.parametrize(
     ("i", "j", "value", "found"),
     [(0, 0, -1e-6, "a variance of -1e-06"), (0, 1, 1.0, "a correlation of"), (2, 5, 1e-3, "symmetric")],
