@@ -110,7 +110,7 @@ class SolvedProblem:
         return solve_joint(replace(self.problem.joint(), config=free, centre=centre), start, kernels_px)
 
 
-FurtherTests = Callable[[CalibrationProblem, State], tuple[ParameterTest, ...]]
+FurtherTests = Callable[[CalibrationProblem, State, Sequence[ParameterTest]], tuple[ParameterTest, ...]]
 
 
 def examine_assumptions(
@@ -119,9 +119,9 @@ def examine_assumptions(
     """Test the assumptions against the data, and consider in the covariance what the data leave open.
 
     Args:
-        further: tests by other data than the matches, asked where these contradict nothing and leave no
-            direction open: else the result is not ok by itself. What they contradict counts; what they leave
-            open is considered as the matches have it.
+        further: tests by other data than the matches, beside the tests by these, asked where these contradict
+            nothing and leave no direction open: else the result is not ok by itself. What they contradict
+            counts; what they leave open is considered as the matches have it.
 
     Returns:
         The tests, the most contradicted first, and what the assumptions add to the covariance.
@@ -132,7 +132,7 @@ def examine_assumptions(
         any(finding.contradicted for finding in findings)
         or weak_directions(estimate.covariance[:7, :7], state.cTl, problem.config.observability)
     ):
-        findings = with_further_tests(findings, further(problem, state), config.threshold)
+        findings = with_further_tests(findings, further(problem, state, findings), config.threshold)
     considered = estimate.considered(config)
     return findings, with_test_results(considered, findings)
 
