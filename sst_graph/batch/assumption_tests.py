@@ -29,7 +29,7 @@ from sst_graph.covariance.match_table import MatchTable, match_table
 from sst_graph.covariance.observability import weak_directions
 from sst_graph.errors import EstimationError
 from sst_graph.graph.building import state_from
-from sst_graph.graph.elimination import Unknowns, marginal_covariance
+from sst_graph.graph.elimination import Eliminated, Unknowns
 from sst_graph.graph.linear import scaled_inverse
 from sst_graph.graph.outer_loop import JointSolution, solve_joint
 from sst_graph.graph.state import State, nuisance_key
@@ -180,8 +180,9 @@ class LinearProblem:
         solution = problem.solve_with(names, start, _ALL_FREE_KERNELS_PX, len(_ALL_FREE_KERNELS_PX))
         graph, at, pairs = solution.graph, solution.values, solution.pairs
         unknowns = Unknowns.of(solution.state, pairs)
-        table = match_table(graph, at, pairs, solution.frozen.state, problem.objects, unknowns)
-        information = scaled_inverse(marginal_covariance(graph, at, unknowns))
+        eliminated = Eliminated.of(graph, at, unknowns)
+        table = match_table(eliminated, at, pairs, solution.frozen.state, problem.objects)
+        information = scaled_inverse(eliminated.covariance())
         state = state_from(at, solution.state, pairs)
         return cls(table, unknowns, information, {name: state.nuisances[name] for name in names}, state)
 

@@ -123,7 +123,7 @@ def _effects(
     names: Sequence[str],
 ) -> list[_Effect]:
     view = scene.view(alignment.lPs, base_tau_s - alignment.base_taus_s, _pixels(alignment, *pose))
-    seen = np.isfinite(view.uvs).all(axis=1)
+    seen = np.asarray(np.isfinite(view.uvs).all(axis=1))
     return [_Effect(ASSUMPTIONS[name].effect(view), seen) for name in names]
 
 
