@@ -137,8 +137,10 @@ def lens_steps(
     graph = replace(graph, estimate=(*graph.estimate, *names))
     free = replace(problem, config=replace(problem.config, graph=graph))
     start = replace(state, nuisances={**state.nuisances, **dict.fromkeys(names, 0.0)})
+    # Under wide kernels but once each: soft matches would follow a wrong lens for many steps more.
+    few = replace(free, config=replace(free.config, max_outer=len(START_KERNELS_PX)))
     try:
-        wide = yield from solution_steps(free, start, START_KERNELS_PX)
+        wide = yield from solution_steps(few, start, START_KERNELS_PX)
         found = yield from _near(free, wide.state)
         met, expected = _support(free, found, start)
         if met < _LOST * expected:
