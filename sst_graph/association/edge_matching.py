@@ -345,9 +345,12 @@ def match_edges(
     poses = paired.poses(cTl, time_offset_s)
     uvs, shift = paired.projected(paired.points.lPs, cTl, time_offset_s, poses), None
     if deviation is not None:
-        paired, poses = _deviated(paired, deviation, uvs), None
-        ideal = paired.projected(paired.points.lPs, cTl, time_offset_s)
-        shift = _pixel_shift(deviation, paired, ideal)
+        effect = _effect(deviation, paired, uvs)
+        if effect.l_shift is not None or effect.time_s is not None:
+            paired, poses = _deviated(paired, effect), None
+            uvs = paired.projected(paired.points.lPs, cTl, time_offset_s)
+            effect = _effect(deviation, paired, uvs)
+        ideal, shift = uvs, _pixel_shift(deviation, paired, uvs, effect)
         uvs = ideal + shift
     index = np.flatnonzero(paired.camera.in_image(uvs))
     some, uvs = paired.take(index), uvs.take(index, axis=0)
@@ -374,7 +377,8 @@ def match_edges(
         tips = tips.take(near, axis=0)
     if shift is not None and deviation is not None:
         shift = shift.take(index, axis=0)
-        tips = tips + _pixel_shift(deviation.take(index), some, tips)
+        own = deviation.take(index)
+        tips = tips + _pixel_shift(own, some, tips, _effect(own, some, tips))
         pixels = pixels - shift
     outward = tips - uvs
     length = np.sqrt(np.vecdot(outward, outward))
@@ -452,10 +456,14 @@ def _contours_or_gradients(
     return ContourFeet(distances, normals, feet, valid), shares
 
 
-def _deviated(paired: PairedEdges, deviation: PointDeviation, uvs: FloatArray) -> PairedEdges:
-    """The points moved, and their intervals changed, by the deviation."""
+def _effect(deviation: PointDeviation, paired: PairedEdges, uvs: FloatArray) -> Effect:
+    """Of the deviation on points at ideal pixels (n, 2) [px]."""
+    return deviation.effect(paired.points.lPs, paired.points.offsets_s, uvs)
+
+
+def _deviated(paired: PairedEdges, effect: Effect) -> PairedEdges:
+    """The points moved, and their intervals changed."""
     points, base_taus_s = paired.points, paired.base_taus_s
-    effect = deviation.effect(points.lPs, points.offsets_s, uvs)
     if effect.l_shift is not None:
         points = replace(points, lPs=points.lPs + effect.l_shift, outward=points.outward + effect.l_shift)
     if effect.time_s is not None:
@@ -463,18 +471,19 @@ def _deviated(paired: PairedEdges, deviation: PointDeviation, uvs: FloatArray) -
     return replace(paired, points=points, base_taus_s=base_taus_s)
 
 
-def _pixel_shift(deviation: PointDeviation, paired: PairedEdges, uvs: FloatArray) -> FloatArray:
-    """(n, 2) distortion: pixels minus the ideal ones ``uvs`` [px].
+def _pixel_shift(
+    deviation: PointDeviation, paired: PairedEdges, uvs: FloatArray, effect: Effect
+) -> FloatArray:
+    """(n, 2) distortion: pixels minus the ideal ones ``uvs`` [px], of the deviation's effect there.
 
     NaN where the picture would fold over: beyond the radius at which a polynomial lens turns back, points
     far outside the view come to lie inside the image.
     """
-    points = paired.points
-    shift = deviation.effect(points.lPs, points.offsets_s, uvs).pixel_shift
+    shift = effect.pixel_shift
     if shift is None:
         return np.zeros_like(uvs)
     arms = uvs - deviation.scene.centre
-    farther = deviation.effect(points.lPs, points.offsets_s, uvs + _OUTWARD * arms).pixel_shift
+    farther = _effect(deviation, paired, uvs + _OUTWARD * arms).pixel_shift
     assert farther is not None
     stretch = ((_OUTWARD * arms + farther - shift) * arms).sum(axis=1)
     folded = stretch < _LEAST_STRETCH * _OUTWARD * (arms**2).sum(axis=1)

@@ -29,7 +29,7 @@ from sst_graph.covariance.match_table import MatchTable, match_table
 from sst_graph.covariance.observability import weak_directions
 from sst_graph.errors import EstimationError
 from sst_graph.graph.building import state_from
-from sst_graph.graph.elimination import Unknowns, marginal_covariance
+from sst_graph.graph.elimination import Eliminated, Unknowns
 from sst_graph.graph.linear import scaled_inverse
 from sst_graph.graph.outer_loop import JointSolution, solve_joint
 from sst_graph.graph.state import State, nuisance_key
@@ -115,7 +115,7 @@ class SolvedProblem:
         return solve_joint(replace(self.problem.joint(), config=free, centre=centre), start, kernels_px)
 
 
-FurtherTests = Callable[[CalibrationProblem, State], tuple[ParameterTest, ...]]
+FurtherTests = Callable[[CalibrationProblem, State, Sequence[ParameterTest]], tuple[ParameterTest, ...]]
 
 
 def examine_assumptions(
@@ -124,9 +124,9 @@ def examine_assumptions(
     """Test the assumptions against the data, and consider in the covariance what the data leave open.
 
     Args:
-        further: tests by other data than the matches, asked where these contradict nothing and leave no
-            direction open: else the result is not ok by itself. What they contradict counts; what they leave
-            open is considered as the matches have it.
+        further: tests by other data than the matches, beside the tests by these, asked where these contradict
+            nothing and leave no direction open: else the result is not ok by itself. What they contradict
+            counts; what they leave open is considered as the matches have it.
 
     Returns:
         The tests, the most contradicted first, and what the assumptions add to the covariance.
@@ -137,7 +137,7 @@ def examine_assumptions(
         any(finding.contradicted for finding in findings)
         or weak_directions(estimate.covariance[:7, :7], state.cTl, problem.config.observability)
     ):
-        findings = with_further_tests(findings, further(problem, state), config.threshold)
+        findings = with_further_tests(findings, further(problem, state, findings), config.threshold)
     considered = estimate.considered(config)
     return findings, with_test_results(considered, findings)
 
@@ -185,8 +185,9 @@ class LinearProblem:
         solution = problem.solve_with(names, start, _ALL_FREE_KERNELS_PX, len(_ALL_FREE_KERNELS_PX))
         graph, at, pairs = solution.graph, solution.values, solution.pairs
         unknowns = Unknowns.of(solution.state, pairs)
-        table = match_table(graph, at, pairs, solution.frozen.state, problem.objects, unknowns)
-        information = scaled_inverse(marginal_covariance(graph, at, unknowns))
+        eliminated = Eliminated.of(graph, at, unknowns)
+        table = match_table(eliminated, at, pairs, solution.frozen.state, problem.objects)
+        information = scaled_inverse(eliminated.covariance())
         state = state_from(at, solution.state, pairs)
         return cls(table, unknowns, information, {name: state.nuisances[name] for name in names}, state)
 

@@ -26,7 +26,7 @@ from sst_graph.covariance.error_model import ErrorModel, fit_error_model
 from sst_graph.covariance.jackknife import ObjectSpread, composed, steps_without
 from sst_graph.covariance.match_table import MatchTable, match_table
 from sst_graph.covariance.sums import ScoreSums
-from sst_graph.graph.elimination import Unknowns, marginal_covariance
+from sst_graph.graph.elimination import Eliminated, Unknowns
 from sst_graph.graph.matching import PairMatches
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import ObjectId
@@ -61,8 +61,9 @@ def robust_covariance(
 ) -> RobustCovariance:
     """Covariance of the unknowns that are not motion, from a frozen graph and its matches."""
     unknowns = Unknowns.of(state, pairs)
-    bread = marginal_covariance(graph, values, unknowns)
-    table = match_table(graph, values, pairs, state, tracks, unknowns)
+    eliminated = Eliminated.of(graph, values, unknowns)
+    bread = eliminated.covariance()
+    table = match_table(eliminated, values, pairs, state, tracks)
     model = fit_error_model(table.residuals)
     return RobustCovariance(covariance_of(bread, table, model), bread, model, unknowns, table)
 

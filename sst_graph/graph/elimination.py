@@ -50,45 +50,65 @@ class Unknowns:
         return np.arange(first, first + (6 if first == 0 else 1))
 
 
+@dataclass(frozen=True)
+class Eliminated:
+    """A frozen graph, linear, whose motion is to be eliminated.
+
+    Attributes:
+        unknowns: that stay.
+        own: (n, n) information of the factors without motion.
+        groups: that of the others by groups of motion.
+    """
+
+    unknowns: Unknowns
+    own: FloatArray
+    groups: Sequence[_Group]
+
+    @classmethod
+    def of(cls, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, unknowns: Unknowns) -> Eliminated:
+        """The graph linearized at some values."""
+        return cls(unknowns, *_information(graph, values, unknowns))
+
+    def covariance(self) -> FloatArray:
+        """(n, n) covariance of the unknowns with the motion marginalised out.
+
+        By a scaled Schur complement, for gtsam.Marginals gives up at condition numbers near 1e9, which metres
+        and pixels in one matrix reach although every direction is observable. Twists that no factor ties to
+        one another are eliminated one after the other: a dense Hessian of a long drive would take a gigabyte.
+        """
+        own = self.own
+        # Scaled to a unit diagonal, that of the motion too.
+        diagonal = np.diag(own).copy()
+        for group in self.groups:
+            diagonal[group.columns] += np.diag(group.information)[: len(group.columns)]
+        scale = scale_of(diagonal)
+        schur = with_ridge(own * np.outer(scale, scale))
+        for columns, information, _ in self.groups:
+            m = len(columns)
+            scales = np.concatenate([scale[columns], scale_of(np.diag(information)[m:])])
+            H = information * np.outer(scales, scales)
+            inner = with_ridge(H[m:, m:])
+            schur[np.ix_(columns, columns)] += H[:m, :m] - H[:m, m:] @ np.linalg.solve(inner, H[m:, :m])
+        return np.asarray(np.linalg.inv(schur) * np.outer(scale, scale))
+
+    def twist_responses(self) -> dict[int, FloatArray]:
+        """(6, n) derivative of the optimum of each twist by the unknowns, by the twist's key."""
+        found = {}
+        for group in self.groups:
+            m = len(group.columns)
+            for at, key in zip(range(m, len(group.information), 6), group.motion, strict=True):
+                rows = group.information[at : at + 6]
+                response = np.zeros((6, self.unknowns.size))
+                response[:, group.columns] = -np.linalg.solve(rows[:, at : at + 6], rows[:, :m])
+                found[key] = response
+        return found
+
+
 def marginal_covariance(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, unknowns: Unknowns
 ) -> FloatArray:
-    """(n, n) covariance of the unknowns with the motion marginalised out.
-
-    By a scaled Schur complement, for gtsam.Marginals gives up at condition numbers near 1e9, which metres and
-    pixels in one matrix reach although every direction is observable. Twists that no factor ties to one
-    another
-    are eliminated one after the other: a dense Hessian of a long drive would take a gigabyte.
-    """
-    own, groups = _information(graph, values, unknowns)
-    # Scaled to a unit diagonal, that of the motion too.
-    diagonal = np.diag(own).copy()
-    for group in groups:
-        diagonal[group.columns] += np.diag(group.information)[: len(group.columns)]
-    scale = scale_of(diagonal)
-    schur = with_ridge(own * np.outer(scale, scale))
-    for columns, information, _ in groups:
-        m = len(columns)
-        scales = np.concatenate([scale[columns], scale_of(np.diag(information)[m:])])
-        H = information * np.outer(scales, scales)
-        inner = with_ridge(H[m:, m:])
-        schur[np.ix_(columns, columns)] += H[:m, :m] - H[:m, m:] @ np.linalg.solve(inner, H[m:, :m])
-    return np.asarray(np.linalg.inv(schur) * np.outer(scale, scale))
-
-
-def twist_responses(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, unknowns: Unknowns
-) -> dict[int, FloatArray]:
-    """(6, n) derivative of the optimum of each twist by the unknowns, by the twist's key."""
-    found = {}
-    for group in _information(graph, values, unknowns)[1]:
-        m = len(group.columns)
-        for at, key in zip(range(m, len(group.information), 6), group.motion, strict=True):
-            rows = group.information[at : at + 6]
-            response = np.zeros((6, unknowns.size))
-            response[:, group.columns] = -np.linalg.solve(rows[:, at : at + 6], rows[:, :m])
-            found[key] = response
-    return found
+    """:meth:`Eliminated.covariance` of a graph."""
+    return Eliminated.of(graph, values, unknowns).covariance()
 
 
 class _Group(NamedTuple):

@@ -13,7 +13,7 @@ from sst_graph.assumptions.model import Scene
 from sst_graph.drive.twists import TwistSamples
 from sst_graph.factors.alignment import Alignment, residuals
 from sst_graph.factors.motion import CameraTwist, moved_points
-from sst_graph.types import FloatArray, IntArray
+from sst_graph.types import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True)
@@ -79,9 +79,10 @@ def residual_columns(
         names: of the assumptions.
     """
     names = list(names)
-    _, J = residuals(alignment, *pose, 0.0)
-    columns = columns_of_jacobian(J, alignment, scene, base_tau_s, pose, names)
-    return dict(zip(names, columns.T, strict=True))
+    effects = _effects(alignment, scene, base_tau_s, pose, names)
+    # Where pixels move alone, a residual follows its pixel, and the motion's Jacobian is not needed.
+    J = None if all(map(_moves_pixels_alone, effects)) else residuals(alignment, *pose, 0.0)[1]
+    return {name: _column(alignment, J, pose[0], effect) for name, effect in zip(names, effects, strict=True)}
 
 
 def columns_of_jacobian(
@@ -99,30 +100,55 @@ def columns_of_jacobian(
         J: (n, 14) by [rot, trans, offset, twist, bias], of residuals as they are or weighted.
         alignment, scene, base_tau_s, pose, names: as of :func:`residual_columns`.
     """
-    view = scene.view(alignment.lPs, base_tau_s - alignment.base_taus_s, _pixels(alignment, *pose))
-    seen = np.isfinite(view.uvs).all(axis=1)
     columns = np.zeros((len(alignment), len(names)))
-    for place, name in enumerate(names):
-        column = _column(alignment, J, pose[0], ASSUMPTIONS[name].effect(view))
-        columns[:, place] = np.where(seen, column, 0.0)
+    for place, effect in enumerate(_effects(alignment, scene, base_tau_s, pose, names)):
+        columns[:, place] = _column(alignment, J, pose[0], effect)
     return columns
 
 
-def _column(alignment: Alignment, J: FloatArray, cTl: gtsam.Pose3, effect: Effect) -> FloatArray:
-    """Derivatives (n,) of residuals by one parameter, from their rows J (n, 14)."""
-    total = np.zeros(len(alignment))
-    if effect.l_shift is not None:
+@dataclass(frozen=True)
+class _Effect:
+    """What one unit of a parameter does to matches: their effect, and (n,) whether they are in front of the
+    camera; nothing is known of the others."""
+
+    of: Effect
+    seen: BoolArray
+
+
+def _effects(
+    alignment: Alignment,
+    scene: Scene,
+    base_tau_s: float | FloatArray,
+    pose: tuple[gtsam.Pose3, float, FloatArray],
+    names: Sequence[str],
+) -> list[_Effect]:
+    view = scene.view(alignment.lPs, base_tau_s - alignment.base_taus_s, _pixels(alignment, *pose))
+    seen = np.asarray(np.isfinite(view.uvs).all(axis=1))
+    return [_Effect(ASSUMPTIONS[name].effect(view), seen) for name in names]
+
+
+def _moves_pixels_alone(effect: _Effect) -> bool:
+    moved = effect.of.l_shift, effect.of.time_s, effect.of.twist_shift
+    return all(each is None for each in moved)
+
+
+def _column(alignment: Alignment, J: FloatArray | None, cTl: gtsam.Pose3, effect: _Effect) -> FloatArray:
+    """Derivatives (n,) of residuals by one parameter, from their rows J (n, 14); without these where they are
+    not weighted and pixels move alone."""
+    total, of = np.zeros(len(alignment)), effect.of
+    if J is not None and of.l_shift is not None:
         # A step of the extrinsic's translation (right perturbation) moves the point in the LiDAR frame.
-        total += np.einsum("ij,ij->i", J[:, 3:6], effect.l_shift)
-    if effect.time_s is not None:
-        total += J[:, 6] * effect.time_s
-    if effect.pixel_shift is not None:
+        total += np.einsum("ij,ij->i", J[:, 3:6], of.l_shift)
+    if J is not None and of.time_s is not None:
+        total += J[:, 6] * of.time_s
+    if of.pixel_shift is not None:
         normals = alignment.columns[2]
         assert normals is not None
-        total += J[:, 13] * np.einsum("ji,ij->i", normals, effect.pixel_shift)
-    if effect.twist_shift is not None:
-        total += (J[:, 7:13] @ np.asarray(cTl.AdjointMap()) * effect.twist_shift).sum(axis=1)
-    return total
+        along = np.einsum("ji,ij->i", normals, of.pixel_shift)
+        total += along if J is None else J[:, 13] * along
+    if J is not None and of.twist_shift is not None:
+        total += (J[:, 7:13] @ np.asarray(cTl.AdjointMap()) * of.twist_shift).sum(axis=1)
+    return np.where(effect.seen, total, 0.0)
 
 
 def _pixels(alignment: Alignment, cTl: gtsam.Pose3, time_offset_s: float, c_twist: FloatArray) -> FloatArray:

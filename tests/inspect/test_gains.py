@@ -15,7 +15,7 @@ from sst_graph.covariance.match_table import MatchTable, match_table
 from sst_graph.drive.preparation import Drive, PrepareConfig, prepare_drive
 from sst_graph.factors import RobustKernel
 from sst_graph.graph.building import PRIOR_ROTATION_SIGMA_RAD, PRIOR_TRANSLATION_SIGMA_M, joint_graph
-from sst_graph.graph.elimination import Unknowns, marginal_covariance
+from sst_graph.graph.elimination import Eliminated, Unknowns
 from sst_graph.graph.matching import GraphConfig, PairMatches, Tracks, associate
 from sst_graph.graph.state import State
 from sst_graph.inspect.frame_gains import frame_gains
@@ -67,8 +67,8 @@ def frozen(motion: str, positions: list[int]) -> tuple[gtsam.NonlinearFactorGrap
     graph, _ = joint_graph(some, state, CONFIG)
     values = values_of(motion, graph)
     unknowns = Unknowns.of(state, some)
-    table = match_table(graph, values, some, state, objects, unknowns)
-    return graph, marginal_covariance(graph, values, unknowns), table
+    eliminated = Eliminated.of(graph, values, unknowns)
+    return graph, eliminated.covariance(), match_table(eliminated, values, some, state, objects)
 
 
 def values_of(motion: str, graph: gtsam.NonlinearFactorGraph) -> gtsam.Values:
@@ -128,7 +128,8 @@ def test_a_view_is_the_frame_alone(motion: str) -> None:
 def test_the_offset_follows_from_the_twist() -> None:
     _, state, pairs, objects = matched("constant")
     unknowns = Unknowns.of(state, pairs)
-    table = match_table(*joint_graph(pairs, state, CONFIG), pairs, state, objects, unknowns)
+    graph, values = joint_graph(pairs, state, CONFIG)
+    table = match_table(Eliminated.of(graph, values, unknowns), values, pairs, state, objects)
     start = 0
     for pair, frame in zip(pairs, gains("constant")[1], strict=True):
         J = table.J[start : start + len(pair)].toarray()

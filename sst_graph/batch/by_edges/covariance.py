@@ -12,7 +12,7 @@ set-up, where edges lie between the beams, and upper edges that may be no outlin
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -161,10 +161,18 @@ def half_samples() -> BoolArray:
 
 
 def half_sample_steps(
-    problem: JointProblem, start: State, objects: Sequence[Mapping[ObjectId, int]]
+    problem: JointProblem,
+    start: State,
+    objects: Sequence[Mapping[ObjectId, int]],
+    enough: Callable[[Mapping[str, FloatArray]], bool] = lambda _: False,
 ) -> Stepwise[tuple[FloatArray, dict[str, FloatArray]]]:
     """Steps (SAMPLES, 7) from the estimate to those of the half-samples, and (SAMPLES,) of each parameter of
-    an assumption; NaN where matches are too few."""
+    an assumption; NaN where matches are too few.
+
+    Args:
+        enough: asked after each half-sample, with the parameters' steps so far: whether the others are left
+            out, whose steps are NaN, too.
+    """
     steps = np.full((SAMPLES, 7), np.nan)
     parameter_steps = {name: np.full(SAMPLES, np.nan) for name in start.nuisances}
     some = [thinned(drive, _POINTS_A_SCAN) for drive in problem.drives]
@@ -178,6 +186,8 @@ def half_sample_steps(
         steps[number] = difference(start, part.state)
         for name, values in parameter_steps.items():
             values[number] = part.state.nuisances[name] - start.nuisances[name]
+        if enough(parameter_steps):
+            break
     return steps, parameter_steps
 
 

@@ -21,8 +21,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sst_graph.assumptions import ASSUMPTIONS, named_sigmas
-from sst_graph.batch.assumption_tests import ParameterTest, few_objects_factor
-from sst_graph.batch.by_edges.covariance import half_sample_steps
+from sst_graph.batch.assumption_tests import ParameterTest, few_objects_factor, with_further_tests
+from sst_graph.batch.by_edges.covariance import SAMPLES, half_sample_steps
 from sst_graph.batch.by_edges.optimum import START_KERNELS_PX
 from sst_graph.batch.by_edges.problem import (
     EdgesProblem,
@@ -117,6 +117,7 @@ def lens_steps(
     state: State,
     objects: Sequence[Mapping[ObjectId, int]],
     config: AssumptionConfig,
+    beside: Sequence[ParameterTest] | None = None,
 ) -> Stepwise[LensTest]:
     """Estimate the parameters of the lens that are held, and test them; step by step.
 
@@ -124,6 +125,8 @@ def lens_steps(
         edges: the problem that was solved.
         state: its estimate.
         objects: tracks of each drive's objects.
+        beside: tests by other data, none of which contradicts anything, that the principal point's are put
+            together with. Nothing is tested where that cannot contradict it.
     """
     problem = edges.whole
     graph = problem.config.graph
@@ -134,8 +137,10 @@ def lens_steps(
     graph = replace(graph, estimate=(*graph.estimate, *names))
     free = replace(problem, config=replace(problem.config, graph=graph))
     start = replace(state, nuisances={**state.nuisances, **dict.fromkeys(names, 0.0)})
+    # Under wide kernels but once each: soft matches would follow a wrong lens for many steps more.
+    few = replace(free, config=replace(free.config, max_outer=len(START_KERNELS_PX)))
     try:
-        wide = yield from solution_steps(free, start, START_KERNELS_PX)
+        wide = yield from solution_steps(few, start, START_KERNELS_PX)
         found = yield from _near(free, wide.state)
         met, expected = _support(free, found, start)
         if met < _LOST * expected:
@@ -144,7 +149,16 @@ def lens_steps(
         return LensTest()
     # Half of the objects, and half of what else is known: but for chance, their optimum is that of the whole.
     halves = replace(free, prior=edges.known.factor(0.5))
-    _, steps = yield from half_sample_steps(halves, found, objects)
+
+    def settled(steps: Mapping[str, FloatArray]) -> bool:
+        if beside is None:
+            return False
+        free_steps = {name: steps[name] for name in names if name in _BESIDE_LABELS}
+        return not _may_contradict(beside, found, free_steps, config.threshold)
+
+    _, steps = yield from half_sample_steps(halves, found, objects, settled)
+    if settled(steps):
+        return LensTest()
     findings = [_finding(name, found.nuisances[name], steps[name], config.threshold) for name in names]
     known = sorted((each for each in findings if each is not None), key=lambda each: -each.score)
     return LensTest(tuple(known), difference(state, found))
@@ -176,8 +190,32 @@ def _finding(name: str, value: float, steps: FloatArray, threshold: float) -> Pa
     return ParameterTest.of(ASSUMPTIONS[name], value, sigma, threshold)
 
 
-def lens_beside_labels(problem: CalibrationProblem, state: State) -> tuple[ParameterTest, ...]:
+def _may_contradict(
+    beside: Sequence[ParameterTest], found: State, steps: Mapping[str, FloatArray], threshold: float
+) -> bool:
+    """Whether tests of the principal point may contradict it beside others, from the steps (SAMPLES,) to the
+    first half-samples; NaN for those to come.
+
+    Their mean square is at least the sum so far over all of them. With a larger deviation the test only comes
+    closer to those beside it, which contradict nothing.
+    """
+    least = few_objects_factor(SAMPLES, threshold) / np.sqrt(SAMPLES)
+    sigmas = {name: max(least * float(np.sqrt(np.nansum(own**2))), 1e-12) for name, own in steps.items()}
+    tests = [
+        ParameterTest(ASSUMPTIONS[name], found.nuisances[name], sigma, False)
+        for name, sigma in sigmas.items()
+    ]
+    return any(each.contradicted for each in with_further_tests(beside, tests, threshold))
+
+
+def lens_beside_labels(
+    problem: CalibrationProblem, state: State, beside: Sequence[ParameterTest] | None = None
+) -> tuple[ParameterTest, ...]:
     """Tests of the principal point of an estimate by labels, by edges of some frames.
+
+    Args:
+        beside: tests by the labels, none of which contradicts anything. Where these and the edges cannot do
+            so together, nothing is tested.
 
     Raises:
         DataError: a frame cannot be read again.
@@ -192,5 +230,5 @@ def lens_beside_labels(problem: CalibrationProblem, state: State) -> tuple[Param
     clocks = tuple(offsets_s[: len(state.time_offsets_s)])
     held = State(state.cTl, clocks, nuisances=dict(state.nuisances))
     edges = edges_problem(calibration, None, LabelEstimate(held, True))
-    found = run_to_end(lens_steps(edges, held, calibration.objects, problem.config.assumptions))
+    found = run_to_end(lens_steps(edges, held, calibration.objects, problem.config.assumptions, beside))
     return tuple(each for each in found.findings if each.assumption.name in _BESIDE_LABELS)

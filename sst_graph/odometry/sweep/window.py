@@ -12,6 +12,7 @@ import itertools
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
+from sst_graph.factors.motion import cross
 from sst_graph.odometry.cloud import compensate_sweep, usable_points
 from sst_graph.odometry.lidar import MOVABLE_CLASSES, LidarOdometry, orthonormal
 from sst_graph.odometry.static_points import on_static_objects
@@ -75,6 +77,11 @@ class _Surfaces:
     azimuths: FloatArray
     sectors: IndexArray
     chosen: IndexArray
+
+    @cached_property
+    def behind(self) -> FloatArray:
+        """(n,) share of a turn that begins behind, from its middle to the azimuths, -0.5 to 0.5."""
+        return turned(self.azimuths, -np.pi) - 0.5
 
 
 @dataclass(frozen=True)
@@ -226,7 +233,9 @@ class Window:
         for surfaces, twist, pose in zip(self._surfaces, self.twists, self._poses, strict=True):
             share = turned(surfaces.azimuths, start_rad) - 0.5
             points = compensate_sweep(surfaces.points, fraction * self.period_s * share, twist)
-            posed.append(_PosedScan(points, cKDTree(points @ pose[:3, :3].T + pose[:3, 3]), twist))
+            world = points @ pose[:3, :3].T + pose[:3, 3]
+            # A tree of few queries: built faster than it is balanced.
+            posed.append(_PosedScan(points, cKDTree(world, balanced_tree=False, compact_nodes=False), twist))
         count = len(self._poses)
         self._matches = [
             self._matched(a, a + interval, posed, gate, scale)
@@ -327,13 +336,15 @@ class Window:
         of_poses, of_times = np.zeros((len(kept), 12)), np.zeros((len(kept), 1 + SECTORS))
         row = np.arange(len(kept))
         for scan, index, R, sign, at in ((a, nearest, Ra, -1.0, 0), (b, kept, Rb, 1.0, 6)):
-            points, own = posed[scan].points[index], sign * (normals @ R)
-            of_poses[:, at : at + 3] = np.cross(points, own)
+            points, own = posed[scan].points.take(index, axis=0), sign * (normals @ R)
+            of_poses[:, at : at + 3] = cross(points.T, own.T).T
             of_poses[:, at + 3 : at + 6] = own
-            rate = np.cross(posed[scan].twist[:3], points) + posed[scan].twist[3:]
+            rate = (
+                np.ascontiguousarray(cross(posed[scan].twist[:3, None], points.T).T) + posed[scan].twist[3:]
+            )
             per_turn = self.period_s * np.einsum("ij,ij->i", own, rate)
             surfaces = self._surfaces[scan]
-            of_times[:, 0] += per_turn * (turned(surfaces.azimuths[index], -np.pi) - 0.5)
+            of_times[:, 0] += per_turn * surfaces.behind[index]
             of_times[row, 1 + surfaces.sectors[index]] += per_turn
         level = np.abs(normals[:, 2]) > _LEVEL
         cells = np.floor(wAs[:, :2] / _CELL_M).astype(np.int64) + 2**20

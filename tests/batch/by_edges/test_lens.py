@@ -81,7 +81,7 @@ def test_half_samples_beside_the_estimate_contradict_no_lens(
     answers, and tell nothing about it."""
 
     def all_right_again(
-        problem: JointProblem, start: State, objects: object
+        problem: JointProblem, start: State, objects: object, enough: object
     ) -> Stepwise[tuple[FloatArray, dict[str, FloatArray]]]:
         yield 1
         steps = {name: -value + 0.1 * (-1.0) ** np.arange(SAMPLES) for name, value in start.nuisances.items()}

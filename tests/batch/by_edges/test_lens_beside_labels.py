@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -13,7 +14,10 @@ from streets import LENS_STREET as STREET
 from sst_graph import CalibrationConfig, SemanticClass, calibrate
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.batch.assumption_tests import ParameterTest, with_further_tests
+from sst_graph.batch.by_edges import covariance
+from sst_graph.batch.by_edges.covariance import SAMPLES
 from sst_graph.batch.by_edges.lens import lens_beside_labels
+from sst_graph.batch.by_edges.solution import solution_steps
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.config import with_overrides
@@ -41,12 +45,12 @@ def drive(right_px: float = 0.0) -> Drive:
     return prepare_drives([kept], CONFIG)[0]
 
 
-def found(own: Drive) -> dict[str, ParameterTest]:
+def found(own: Drive, beside: Sequence[ParameterTest] | None = None) -> dict[str, ParameterTest]:
     """What edges say, from an estimate that makes up for a principal point by a turn, as labels do."""
     turned = (own.camera.cx - simulated(STREET).camera.cx) / own.camera.fx
     state = replace(truth(), cTl=truth().cTl.retract(np.array([0.0, 0.0, turned, 0.0, 0.0, 0.0])))
     problem = CalibrationProblem.of([own], Guess(truth().cTl, truth().time_offsets_s[0]), CONFIG)
-    return {each.assumption.name: each for each in lens_beside_labels(problem, state)}
+    return {each.assumption.name: each for each in lens_beside_labels(problem, state, beside)}
 
 
 def test_the_right_principal_point_is_not_contradicted() -> None:
@@ -60,6 +64,27 @@ def test_the_right_principal_point_is_not_contradicted() -> None:
 def test_a_wrong_one_is_found(right_px: float) -> None:
     cx = found(drive(right_px))["cx"]
     assert cx.contradicted and cx.value == pytest.approx(right_px, abs=2.5)
+
+
+@pytest.mark.parametrize("right_px", [0.0, 8.0])
+def test_half_samples_that_decide_nothing_are_left_out(
+    right_px: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The outcome is that of all of them."""
+    solved: list[int] = []
+
+    def counting(*arguments: object) -> object:
+        solved.append(1)
+        return solution_steps(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(covariance, "solution_steps", counting)
+    labels = tuple(ParameterTest(ASSUMPTIONS[name], 2.0, 4.0, False) for name in ("cx", "cy"))
+    own = drive(right_px)
+    everything = with_further_tests(labels, tuple(found(own).values()), 3.3)
+    whole, solved[:] = len(solved), []
+    assert with_further_tests(labels, tuple(found(own, labels).values()), 3.3) == everything
+    assert any(each.contradicted for each in everything) == (right_px > 0.0)
+    assert whole == SAMPLES and (len(solved) <= 3 if right_px == 0.0 else len(solved) == SAMPLES)
 
 
 def test_frames_without_pictures_or_that_cannot_be_read_tell_nothing() -> None:
