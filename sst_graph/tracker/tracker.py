@@ -328,6 +328,8 @@ class Tracker:
         """The update for a scan that has been used; the estimate is adopted where held-out frames agree."""
         self.monitor.changes.recheck_start(matches.scan, self.estimate.for_comparison())
         reason = "" if matches.new else "no match: no scan met an image that shows the same objects"
+        if reason and (lacking := self.inputs.window.lacking_labels()):
+            reason = f"{reason} ({lacking})"
         update = make_update(self, stamp_ns, reason, chi2=chi2)
         trusted = bool(matches.new) and update.status == "ok"
         adopted = self.monitor.adoption.propose(self.estimate.point, trusted)
