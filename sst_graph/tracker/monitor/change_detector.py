@@ -54,6 +54,7 @@ _LOST_SHARE = 0.12
 """Largest fraction of the boundary points in view that counts as almost none."""
 _LACKING = 3.0
 """Contours per boundary point in view that are so many times shorter than usual: labels are missing."""
+_MISSING_LABELS = "what ought to be in view has no labels in the images: those of some objects are missing"
 _USUAL_SHOWN = 60
 """Frames whose contours say what is usual."""
 _LEAST_IN_VIEW = 16
@@ -315,7 +316,7 @@ class ChangeDetector:
         """
         self.suspected_change = ""
         if self.far and self._lacking:
-            self.suspected_change = "what ought to be in view has no labels in the images: those of some objects are missing"
+            self.suspected_change = _MISSING_LABELS
         elif self.lost:
             return self._restart(estimate.point, _LOST_FRAMES, chi2)
         elif self.statistic.confirmed:
