@@ -49,18 +49,23 @@ def with_causes(
     may be wrong and does not show is a remark."""
     by_labels = config.method not in ("motion", "edges", "both")
     found = preflight(drives, guess, config.classes if by_labels else ())
+    said = tuple(
+        f"{drive.name}: {drive.sweep.contradiction}"
+        for drive in drives
+        if drive.sweep is not None and drive.sweep.contradiction
+    )
     estimated = bool(result.frames_used)
-    if not found and estimated:
+    if not (found or said) and estimated:
         camera = other_camera(guess.cTl, result.T_camera_lidar, result.covariance)
         found = () if camera is None else (camera,)
-    if not found and config.find_causes and config.method == "joint":
+    if not (found or said) and config.find_causes and config.method == "joint":
         found = _suspected(result, drives, guess, config)
     if estimated and _relies_on_principal_point(config.assumptions):
         remark = uncalibrated(result.camera)
         result = result if remark is None else replace(result, reasons=(*result.reasons, remark.sentence))
-    if not found:
+    if not (found or said):
         return result
-    reasons = (*(finding.sentence for finding in found), *result.reasons)
+    reasons = (*said, *(finding.sentence for finding in found), *result.reasons)
     return replace(result, status="not_converged" if estimated else result.status, reasons=reasons)
 
 

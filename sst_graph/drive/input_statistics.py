@@ -189,7 +189,7 @@ def image_statistics(index: int, image: CameraImage, closely: bool = True) -> Im
     # Sums of the places of each class's pixels: whole numbers below 2^53, which are exact.
     places = np.bincount(image.mask.ravel(), _places(image.mask.size), minlength=1)
     rows = {c: float(places[c] / count // width) for c, count in labelled.items()}
-    shows = image.has_picture and (_varies(image.pixels[::_FEW, ::_FEW]) or _varies(image.pixels))
+    shows = shows_something(image)
     known = image.pixels if shows else image.mask
     nothing = not image.has_picture and not image.has_mask
     return ImageStatistics(
@@ -201,6 +201,11 @@ def image_statistics(index: int, image: CameraImage, closely: bool = True) -> Im
         contour_profiles(image.mask, image.pixels, SemanticClass.VEHICLE) if closely and shows else (),
         int(image.pixels.max()) if image.has_picture else None,
     )
+
+
+def shows_something(image: CameraImage) -> bool:
+    """Whether the picture is there and not of a single colour."""
+    return image.has_picture and (_varies(image.pixels[::_FEW, ::_FEW]) or _varies(image.pixels))
 
 
 _FEW = 16

@@ -117,6 +117,11 @@ class ContourMap:
         return cls(distance, left, top, mask.shape[1], mask.shape[0], unknown, edges, stretch)
 
     @property
+    def contour_px(self) -> int:
+        """Pixels along the contour, on both sides of it."""
+        return int(np.count_nonzero(np.abs(self.distance) < 1.0))
+
+    @property
     def box(self) -> tuple[int, int]:
         """Columns and rows of the box."""
         rows, columns = shape_of(self, "distance")

@@ -94,8 +94,8 @@ class SimulatedDrive:
 
     @property
     def sweep(self) -> str:
-        """What the drive states about its sweep: that the whole scan is taken at once, or nothing."""
-        return "auto" if self.config.rolling else "compensated"
+        """What the drive knows about its sweep: that the whole scan is taken at once, or nothing."""
+        return "auto" if self.config.rolling else "known"
 
     @property
     def lidar(self) -> Lidar:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sst_graph.assumptions.of_time import SWEEP
-from sst_graph.batch.assumption_tests import ParameterTest, with_test_results
+from sst_graph.batch.assumption_tests import ParameterTest, contradiction_sentence, with_test_results
 from sst_graph.covariance.considered import Considered, considered_by_steps
 from sst_graph.covariance.undecided_sweep import SweepEffect
 from sst_graph.errors import EstimationError
@@ -183,8 +183,14 @@ class OnlineEstimate:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Why the estimate may be wrong altogether."""
+        """Why an estimate by edges may be wrong altogether."""
         return () if self.edges is None else self.edges.reasons_for(self.uncertainty)
+
+    @property
+    def contradictions(self) -> tuple[str, ...]:
+        """What the data contradict of what is assumed or was said of them, the likely causes first."""
+        said = "" if self.sweep is None else self.sweep.contradiction
+        return (*filter(None, [said]), *contradiction_sentence(self.findings), *self.reasons)
 
     def by_sweep(self) -> SweepEffect:
         """The effect of a sweep that the scans leave undecided.

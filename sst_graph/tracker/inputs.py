@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import zlib
 from collections import deque
 from typing import Any, TypeVar
 
+import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from sst_graph.drive.geometric_labels import labelled_by_geometry
+from sst_graph.drive.input_statistics import shows_something
 from sst_graph.drive.preparation import TRACK_INTERVAL_S, image_features, scan_features
 from sst_graph.drive.stamp_intervals import Jump, StampMonitor
 from sst_graph.errors import DataError
@@ -36,6 +40,9 @@ _MAX_EDGE_IMAGES = 100
 """The same where edges are aligned: the gradients of a picture take 8.5 bytes a pixel."""
 _MAX_FAILURES = 10
 """Failures in a row after which the window is given up: it is then their likely cause."""
+_MOVED_M, _FASTEST_STOP_MPS = 0.05, 2.0
+"""Motion after which a picture is another one [m]; and the speed from which no vehicle stops within a
+scan: it would brake with 20 m/s^2 at 10 Hz [m/s]."""
 _SEARCH_MARGIN_S = 1.0
 """Images farther from a scan are kept, too, until the time offset is known [s]."""
 
@@ -99,6 +106,64 @@ def _with_own_arrays(data: _Data) -> _Data:
     return dataclasses.replace(data, **arrays)
 
 
+class FrozenSensors:
+    """Whether a sensor delivers its last frame again while the vehicle moves: no sensor measures the same
+    twice, to the last bit.
+
+    Attributes:
+        image: digest of the latest picture that was used, 0 of one that shows nothing; the LiDAR's pose then.
+        scan: digest of the latest scan that was used; the LiDAR's speed then [m/s].
+    """
+
+    def __init__(self) -> None:
+        self.image, self.scan = (0, gtsam.Pose3()), (0, 0.0)
+
+    def check_image(self, image: CameraImage, wTl: gtsam.Pose3) -> None:
+        """Refuse an image that the LiDAR's motion since the one before contradicts.
+
+        Raises:
+            DataError: it does.
+        """
+        before, place = self.image
+        moved_m = float(np.linalg.norm(place.between(wTl).translation()))
+        if before and moved_m > _MOVED_M and before == _of_picture(image):
+            found = f"the picture before once more, to the last bit, after {moved_m:.1f} m (a frozen camera)"
+            raise DataError("image", found, "a new one: look at the camera's driver and its recording")
+
+    def check_scan(self, scan: Scan) -> None:
+        """Refuse a scan that would be the last one of a vehicle that stops at once.
+
+        Raises:
+            DataError: it would.
+        """
+        before, speed_mps = self.scan
+        if before and speed_mps > _FASTEST_STOP_MPS and before == _digest(scan.points):
+            found = f"the scan before once more, to the last bit, at {speed_mps:.0f} m/s (a frozen LiDAR)"
+            raise DataError("scan", found, "a new one: look at the LiDAR's driver and its recording")
+
+    def add_image(self, image: CameraImage, wTl: gtsam.Pose3) -> None:
+        """An image was used."""
+        shown = _of_picture(image)
+        if shown != self.image[0]:
+            self.image = shown, wTl
+
+    def add_scan(self, scan: Scan, speed_mps: float) -> None:
+        """A scan was used."""
+        shown = _digest(scan.points) if len(scan.points) else 0
+        if shown != self.scan[0]:
+            self.scan = shown, speed_mps
+
+
+def _digest(array: NDArray[Any]) -> int:
+    """Of every fourth row: noise is in all of them."""
+    return zlib.crc32(np.ascontiguousarray(array[::4]).data)
+
+
+def _of_picture(image: CameraImage) -> int:
+    """Digest of the picture; 0 of one that shows nothing. Labels of what is far away may stay the same."""
+    return _digest(image.pixels) if shows_something(image) else 0
+
+
 class SensorInputs:
     """The latest scans and images, the LiDAR's motion, and the stamps of both sensors.
 
@@ -108,6 +173,7 @@ class SensorInputs:
         odometry: of the LiDAR.
         stamps: intervals of both sensors' stamps.
         image_order, scan_order: which stamps may come next.
+        frozen: whether a sensor repeats its last frame.
         first_frames: by which a drive is recognized when a tracker is resumed.
         last_scan: the newest scan.
         failures: why scans or images in a row could not be used.
@@ -136,6 +202,7 @@ class SensorInputs:
         self.odometry = LidarOdometry(self.config.calibration.lidar_odometry)
         self.stamps = StampMonitor(self.config.alarm.chi2)
         self.image_features = FeatureTracker()
+        self.frozen = FrozenSensors()
 
     def check_image(self, image: CameraImage) -> tuple[CameraImage, int]:
         """The image as it may be used, and by how much its clock was set, 0 if it was not [ns].
@@ -145,6 +212,8 @@ class SensorInputs:
         """
         checked = checked_image(image, self.camera)
         clock_step_ns = self.image_order.check(checked.stamp_ns)
+        if self.image_order.newest_ns is not None and checked.stamp_ns > self.image_order.newest_ns:
+            self.frozen.check_image(checked, self.window.wTl)
         return _with_own_arrays(checked), clock_step_ns
 
     def check_scan(self, scan: Scan) -> tuple[Scan, int]:
@@ -155,6 +224,7 @@ class SensorInputs:
         """
         checked = checked_scan(scan)
         clock_step_ns = self.scan_order.check(checked.stamp_ns)
+        self.frozen.check_scan(checked)
         return _with_own_arrays(checked), clock_step_ns
 
     def add_image(self, image: CameraImage, clock_step_ns: int, estimate: OnlineEstimate) -> None:
@@ -167,6 +237,7 @@ class SensorInputs:
             self.window.forget_images_before(self.window.next_image)
         self._check_lateness(image, estimate.point.time_offset_s)
         self.image_order.add(image.stamp_ns, clock_step_ns != 0)
+        self.frozen.add_image(image, self.window.wTl)
         self.stamps.add_image(image.stamp_ns, self.window.place)
         calibration = self.config.calibration
         features = image_features(self.window.next_image, image, calibration.classes, calibration.image_edges)
@@ -194,6 +265,7 @@ class SensorInputs:
         index = self.window.next_scan if frame is None else frame
         features = scan_features(index, labelled, calibration.classes, prepare, with_lower_edges=used)
         self.window.add_scan(features, self.odometry.add(labelled))
+        self.frozen.add_scan(scan, self.window.latest_step()[1])
         self.last_scan = scan
         self._forget_images(estimate)
         self.first_frames.add(scan)

@@ -40,9 +40,11 @@ def tracker_result(tracker: Tracker, drive: str, camera_name: str) -> Calibratio
     elif last.status == "contradicted":
         reasons = (*last.contradictions, *reasons)
     elif last.status == "unconfirmed":
-        reasons = _unconfirmed(last, tracker.monitor)
+        reasons = tuple(filter(None, (*_unconfirmed(last, tracker.monitor), window.lacking_labels())))
     elif last.status != "ok":
         reasons = tuple(filter(None, (_NO_ESTIMATE[last.status], tracker.initializer.why)))
+    if last.status != "ok":
+        reasons = (*reasons, *_refused(tracker.last_update))
     if last.undecided_sweep:
         reasons = (*reasons, last.undecided_sweep)
     entries = {} if estimate.smoother is None else estimate.smoother.entries
@@ -99,3 +101,8 @@ def _unconfirmed(last: TrackUpdate, monitor: Monitor) -> tuple[str, ...]:
         "no frame would have shown a change of where the camera looks for the last "
         f"{last.unconfirmed_s:.1f} s{of_offset}",
     )
+
+
+def _refused(last: TrackUpdate | None) -> tuple[str, ...]:
+    """Why data of the last frame were not used."""
+    return (last.reason,) if last is not None and last.refused else ()

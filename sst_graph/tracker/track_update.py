@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import gtsam
 import numpy as np
 
-from sst_graph.batch.assumption_tests import contradiction_sentence
 from sst_graph.batch.method_estimate import UNKNOWN_SIGMAS
 from sst_graph.covariance.observability import open_directions
 from sst_graph.result import WeakDirection
@@ -136,7 +135,7 @@ def make_update(
     """
     estimate, changes = tracker.estimate, tracker.monitor.changes
     point, covariance = estimate.point, estimate.reported_covariance()
-    confirmation, contradictions = changes.confirmation, contradiction_sentence(estimate.findings)
+    confirmation, contradictions = changes.confirmation, estimate.contradictions
     # Where no scan can be used, nothing confirms the estimate either.
     since_scan_s = tracker.inputs.window.seconds_since_scan(stamp_ns) if estimate.exists else 0.0
     status: TrackStatus = "alarm" if tracker.initializer.alarmed else "starting"
@@ -150,7 +149,6 @@ def make_update(
         too_old = confirmation.too_old_after(since_scan_s)
         unconfirmed = changes.start_unconfirmed or contradicted or too_old or sweep
         status = "unobservable" if weak else "unconfirmed" if unconfirmed else "ok"
-        contradictions = (*contradictions, *estimate.reasons)
         status = "contradicted" if contradictions else status
     return TrackUpdate(
         stamp_ns=stamp_ns,

@@ -107,15 +107,9 @@ class Tracker:
 
     def add_image(self, image: CameraImage) -> TrackUpdate:
         """Add an image; it is used as soon as a scan close to it in true time is there."""
-        try:
-            # 1. Check the image and its stamp.
-            checked, clock_step_ns = self.inputs.check_image(image)
-            with Snapshot(self):
-                # 2. Its contours go into the window.
-                self.inputs.add_image(checked, clock_step_ns, self.estimate)
-                return make_update(self, checked.stamp_ns)
-        except Exception as error:
-            return self._not_added("image", image, error)
+        update = self._use_image(image, with_update=True)
+        assert update is not None
+        return update
 
     def add_scan(self, scan: Scan, frame: int | None = None) -> TrackUpdate:
         """Add a scan, and estimate; where anything fails, everything is as it was.
@@ -238,14 +232,26 @@ class Tracker:
 
     # ------------------------------------------------------------------ steps
 
+    def _use_image(self, image: CameraImage, with_update: bool) -> TrackUpdate | None:
+        """Add an image; the update, which one that was used has only where it is asked for."""
+        try:
+            # 1. Check the image and its stamp.
+            checked, clock_step_ns = self.inputs.check_image(image)
+            with Snapshot(self.inputs):
+                # 2. Its contours go into the window.
+                self.inputs.add_image(checked, clock_step_ns, self.estimate)
+                return make_update(self, checked.stamp_ns) if with_update else None
+        except Exception as error:
+            return self._not_added("image", image, error)
+
     def _add_sensors(self, frame: Frame) -> TrackUpdate:
         """Add a frame's image, then its scan."""
-        of_image = None if frame.image is None else self.add_image(frame.image)
+        of_image = None if frame.image is None else self._use_image(frame.image, frame.scan is None)
         if frame.scan is None:
             assert of_image is not None
             return of_image
         update = self.add_scan(frame.scan, frame.index)
-        if of_image is None or of_image.accepted:
+        if of_image is None:
             return update
         reason = "; ".join(filter(None, (of_image.reason, update.reason)))
         refused = (*of_image.refused, *update.refused)
@@ -328,6 +334,8 @@ class Tracker:
         """The update for a scan that has been used; the estimate is adopted where held-out frames agree."""
         self.monitor.changes.recheck_start(matches.scan, self.estimate.for_comparison())
         reason = "" if matches.new else "no match: no scan met an image that shows the same objects"
+        if reason and (lacking := self.inputs.window.lacking_labels()):
+            reason = f"{reason} ({lacking})"
         update = make_update(self, stamp_ns, reason, chi2=chi2)
         trusted = bool(matches.new) and update.status == "ok"
         adopted = self.monitor.adoption.propose(self.estimate.point, trusted)

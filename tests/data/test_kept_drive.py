@@ -22,7 +22,7 @@ def street() -> SimulatedDrive:
 
 
 def test_a_kept_drive_has_the_sweep_of_its_source(street: SimulatedDrive) -> None:
-    assert KeptDrive.of(street).sweep == street.sweep == "compensated"
+    assert KeptDrive.of(street).sweep == street.sweep == "known"
     assert KeptDrive.of(street, sweep="auto").sweep == "auto"
 
 

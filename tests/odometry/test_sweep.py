@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 from stored import simulated
+from streets import prepared_street, standing_street
 
-from sst_graph import open_source
+from sst_graph import CalibrationConfig, open_source
+from sst_graph.batch.causes import with_causes
 from sst_graph.cli import main
 from sst_graph.errors import ConfigError
 from sst_graph.odometry.sweep import (
@@ -26,9 +28,10 @@ from sst_graph.odometry.sweep import (
 )
 from sst_graph.odometry.sweep.estimate import CANDIDATES, Evidence, estimate
 from sst_graph.odometry.sweep.window import SECTORS, Window
+from sst_graph.result import CalibrationResult, FrameId
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate, write_drive
 from sst_graph.sweep_timing import SweepTiming
-from sst_graph.types import Frame, Scan
+from sst_graph.types import Frame, Guess, Scan
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 PARKED = DATA / "kitti_2011_09_26_parked"
@@ -322,6 +325,52 @@ def test_a_source_is_read_once_and_its_own_times_are_kept() -> None:
     assert given.sweep_decision.kind == "given"
     np.testing.assert_array_equal(given[1].scan.offsets_s, timed[1].scan.offsets_s)  # type: ignore[union-attr]
     assert with_sweep(source, decide=False).sweep_decision.kind == "given"
+
+
+class Hall:
+    """Fourteen scans of a hall at 6 m/s as a source, of whose sweep something is said."""
+
+    name, camera, nominal, truth = "hall", None, None, None
+
+    def __init__(self, fraction: float, sweep: str) -> None:
+        self.scan, self.sweep = _hall(6.0, fraction, 180.0), sweep
+
+    def __len__(self) -> int:
+        return 14
+
+    def __getitem__(self, position: int) -> Frame:
+        return Frame(position, self.scan(position), None)
+
+
+@pytest.mark.parametrize(
+    ("fraction", "said", "instead"),
+    [(-1.0, "compensated", "clockwise"), (0.0, "azimuth", "compensated"), (-1.0, "clockwise", "")],
+)
+def test_what_is_said_of_the_sweep_is_compared_with_the_scans(
+    fraction: float, said: str, instead: str
+) -> None:
+    source: Any = Hall(fraction, said)
+    swept = with_sweep(source)
+    decision = swept.sweep_decision
+    assert decision.kind == "given" and swept[3].scan.offsets_s is None  # type: ignore[union-attr]
+    assert bool(decision.contradiction) == bool(instead)
+    assert not instead or f"--sweep {said} says" in decision.contradiction
+    assert decision.contradiction.endswith(f"say --sweep {instead}" if instead else "")
+    # A result that rests on it is not trusted, and says so first.
+    drive = replace(prepared_street(), sweep=decision)
+    truth = standing_street().truth
+    result = CalibrationResult(
+        truth.cTl, 0.0, np.eye(7), "ok", drive.camera, "cam", frames_used=(FrameId(drive.name, 0),)
+    )
+    checked = with_causes(result, [drive], Guess(truth.cTl, 0.0), CalibrationConfig(find_causes=False))
+    assert (checked.status == "not_converged") == bool(instead)
+    assert any(decision.contradiction in reason for reason in checked.reasons[:1]) == bool(instead)
+
+
+def test_nothing_is_compared_where_the_sweep_is_known_or_not_to_be_decided() -> None:
+    for source, decide in ((Hall(-1.0, "known"), True), (Hall(-1.0, "compensated"), False)):
+        decision = with_sweep(source, decide).sweep_decision  # type: ignore[arg-type]
+        assert decision.kind == "given" and decision.contradiction == "" and not decision.frames
 
 
 def test_a_first_scan_without_points_says_nothing_of_times() -> None:

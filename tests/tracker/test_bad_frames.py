@@ -11,7 +11,8 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from streets import EARLY_START, saved_tracker
+from stored import simulated
+from streets import EARLY_START, TRACKED_STREET, saved_tracker
 
 from sst_graph import CalibrationConfig, PinholeCamera, Tracker
 from sst_graph.batch.config import Method
@@ -408,3 +409,81 @@ def test_what_readers_leave_out_is_carried_over(street: SimulatedDrive, frames: 
     assert checked_scan(empty, fewest=0) == Scan(5, scan.points[:0], scan.classes[:0], left_out=2)
     with pytest.raises(DataError, match="0 points, expected 1 to"):
         checked_scan(empty)
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[Frame]:
+    """The drive of that tracker."""
+    return list(simulated(TRACKED_STREET))
+
+
+def _frozen(frames: list[Frame], since: int, *sensors: str) -> list[Frame]:
+    """The frames, from one on with the data of some sensors as they were in the frame before."""
+
+    def again(frame: Frame) -> Frame:
+        held = {}
+        for sensor in sensors:
+            last, own = getattr(frames[since - 1], sensor), getattr(frame, sensor)
+            held[sensor] = dataclasses.replace(last, stamp_ns=own.stamp_ns)
+        return dataclasses.replace(frame, **held)
+
+    return [frame if frame.index < since else again(frame) for frame in frames]
+
+
+@pytest.mark.parametrize("sensor", ["image", "scan"])
+def test_a_frozen_sensor_is_named_and_moves_no_estimate(
+    sensor: str, running: Path, frames: list[Frame]
+) -> None:
+    tracker = Tracker.load(running)
+    before = tracker.estimate.point
+    lines = [tracker.add(frame) for frame in _frozen(frames, 14, sensor)[14:]]
+    assert len(lines) > 15
+    assert all(
+        line.refused == (sensor,) and f"a frozen {'camera' if sensor == 'image' else 'LiDAR'}" in line.reason
+        for line in lines
+    )
+    # No alarm, and nothing that the sensor does not see is taken for a changed calibration.
+    assert not any(line.alarm or line.suspected_change for line in lines)
+    assert lines[-1].status != "ok" and lines[-1].unconfirmed_s > 1.0
+    step = gtsam.Pose3.Logmap(before.cTl.between(tracker.estimate.point.cTl))
+    assert (np.abs(step) < lines[-1].sigmas[:6]).all()
+    # A result that ends so says why.
+    assert f"a frozen {'camera' if sensor == 'image' else 'LiDAR'}" in tracker.result().reasons[-1]
+
+
+def test_equal_frames_of_a_standing_vehicle_are_right(running: Path, frames: list[Frame]) -> None:
+    tracker = Tracker(Tracker.load(running).setup.camera)
+    assert not any(tracker.add(frame).refused for frame in _frozen(frames[:6], 1, "image", "scan"))
+    # Pictures of one colour show nothing.
+    black = [
+        dataclasses.replace(
+            f, image=f.image and dataclasses.replace(f.image, pixels=np.zeros_like(f.image.pixels))
+        )
+        for f in frames
+    ]
+    tracker = Tracker.load(running)
+    assert all(tracker.add(frame).accepted for frame in black[14:20])
+
+
+@pytest.mark.parametrize("side", ["image", "scan"])
+def test_labels_that_are_missing_on_one_side_are_named(side: str, running: Path, frames: list[Frame]) -> None:
+    def unlabelled(frame: Frame) -> Frame:
+        assert frame.image is not None and frame.scan is not None
+        if side == "image":
+            return dataclasses.replace(
+                frame, image=dataclasses.replace(frame.image, mask=np.zeros_like(frame.image.mask))
+            )
+        classes = np.zeros_like(frame.scan.classes)
+        return dataclasses.replace(frame, scan=dataclasses.replace(frame.scan, classes=classes))
+
+    tracker = Tracker.load(running)
+    lines = [tracker.add(unlabelled(frame)) for frame in frames[14:30]]
+    assert not any(line.alarm or line.suspected_change for line in lines)
+    said, other = ("images", "scans") if side == "image" else ("scans", "images")
+    expected = f"the latest 16 {said} without labels of objects, which the {other} have"
+    assert lines[-1].reason.endswith(f"({expected})")
+    assert lines[-1].unconfirmed_s > 1.0
+    assert tracker.inputs.window.lacking_labels() == expected
+    # With labels again, all is well.
+    assert [tracker.add(frame).reason for frame in frames[30:33]][-1] == ""
+    assert tracker.inputs.window.lacking_labels() == ""

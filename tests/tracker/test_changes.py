@@ -399,3 +399,38 @@ def _yaw_error(
     error = float(axis @ gtsam.Rot3.Logmap(truth.between(cTl.rotation())))
     sigma = float(np.sqrt(axis @ found.covariance[:3, :3] @ axis))
     return float(np.degrees(error)), float(np.degrees(sigma))
+
+
+def test_labels_of_most_objects_that_are_missing_are_no_change(
+    street: SimulatedDrive, frames: list[Frame]
+) -> None:
+    """Left are those of the object that covers least of the image, as where a network knows no cars."""
+
+    def left(frame: Frame) -> Frame:
+        image = frame.image
+        assert image is not None and image.instances is not None
+        counts = np.bincount(image.instances[image.mask == SemanticClass.VEHICLE])
+        seen = np.flatnonzero(counts)
+        kept = seen[np.argmin(counts[seen])] if len(seen) else 0
+        gone = (image.mask == SemanticClass.VEHICLE) & (image.instances != kept)
+        mask = np.where(gone, np.uint8(SemanticClass.GROUND), image.mask)
+        return dataclasses.replace(frame, image=dataclasses.replace(image, mask=mask))
+
+    tracker = tracker_from_truth(street)
+    lines = [tracker.add(frame if frame.index < 20 else left(frame)) for frame in frames]
+    assert not any(line.alarm for line in lines)
+    assert "are missing" in lines[-1].suspected_change and lines[-1].status != "ok"
+
+
+def test_a_scan_without_match_is_not_compared_again_when_its_turn_comes(
+    street: SimulatedDrive, frames: list[Frame]
+) -> None:
+    tracker = tracker_from_truth(street)
+    for frame in frames:
+        tracker.add(frame)
+    changes, compared = tracker.monitor.changes, tracker.estimate.for_comparison()
+    known, latest = list(changes.scans), changes.statistic.latest
+    old = tracker.inputs.window.next_scan - 25
+    assert old not in known
+    assert changes.check([old], {old: 100}, compared) is None
+    assert list(changes.scans) == known and changes.statistic.latest is latest

@@ -1,4 +1,4 @@
-"""A sweep that the scans leave undecided: the tracker and the batch treat it by one rule."""
+"""A sweep that the scans leave undecided, or that is not as was said: one rule for tracker and batch."""
 
 from __future__ import annotations
 
@@ -95,3 +95,16 @@ def test_no_line_of_track_is_ok_where_the_sweep_is_open(
         assert sweep["kind"] == "undecided" and result["status"] == "not_converged"
         assert lines[-1]["undecided_sweep"] in result["reasons"]
         assert not any(line["status"] == "ok" for line in lines)
+
+
+def test_no_line_is_ok_where_the_scans_contradict_what_was_said_of_them() -> None:
+    drive = simulated(SLOW)
+    found = replace(OPEN, kind="clockwise", timing=BOTH[0], others=())
+    said = found.given_as("compensated")
+    assert said.contradiction and not found.given_as("azimuth").contradiction
+    config = with_overrides(TrackerConfig(), streets.SOON)
+    tracker = Tracker(drive.camera, config, drive.nominal, sweep=said)
+    lines = [tracker.add(frame) for frame in drive]
+    assert all(line.contradictions == (said.contradiction,) for line in lines)
+    assert {line.status for line in lines} == {"starting", "contradicted"}
+    assert tracker.result().reasons[0] == said.contradiction

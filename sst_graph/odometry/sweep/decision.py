@@ -24,6 +24,15 @@ SweepKind = Literal["compensated", "clockwise", "counterclockwise", "undecided",
 given."""
 FRACTIONS: dict[str, float] = {"compensated": 0.0, "clockwise": -1.0, "counterclockwise": 1.0}
 
+CLAIMS: dict[str, Hypothesis] = {
+    "compensated": "compensated",
+    "instant": "compensated",
+    "clockwise": "clockwise",
+    "azimuth": "clockwise",
+    "counterclockwise": "counterclockwise",
+}
+"""What may be said of the sweep (``--sweep``), as one of the hypotheses."""
+
 REMEDY = "say --sweep compensated, clockwise or counterclockwise, or give points' times"
 
 
@@ -69,6 +78,7 @@ class SweepDecision:
         speed_mps: fastest mean speed of the windows.
         frames: positions of the scans used, in the order of the drive.
         others: times of the points under the hypotheses that are not excluded, beside ``timing``.
+        contradiction: how the scans contradict what was said of the sweep; empty where they do not.
     """
 
     kind: SweepKind
@@ -80,6 +90,7 @@ class SweepDecision:
     speed_mps: float = 0.0
     frames: tuple[int, ...] = ()
     others: tuple[SweepTiming, ...] = ()
+    contradiction: str = ""
 
     @property
     def shares(self) -> dict[float, float]:
@@ -97,7 +108,7 @@ class SweepDecision:
     def sentence(self) -> str:
         """The decision in words."""
         if self.kind == "given":
-            return "as given"
+            return "as given" + f", but {self.contradiction}" * bool(self.contradiction)
         if self.kind == "standstill":
             return "assumed compensated: at standstill it does not matter"
         if self.kind == "undecided":
@@ -122,6 +133,19 @@ class SweepDecision:
         if self.kind == "undecided":
             return f"{share}; compensated 0, clockwise -1, counter-clockwise +1"
         return share
+
+    def given_as(self, word: str) -> SweepDecision:
+        """What was said of the sweep, one of :data:`CLAIMS`, which holds; where this decision, of the same
+        scans, is another one, ``contradiction`` says so.
+        """
+        claim, contradiction = CLAIMS[word], ""
+        if self.kind in FRACTIONS and self.kind != claim:
+            contradiction = (
+                f"the scans are not as --sweep {word} says, but {self.sentence}: leave --sweep out, or say "
+                f"--sweep {self.kind}"
+            )
+        untimed = SweepTiming(0.0, 0.0, 0.1)
+        return replace(self, kind="given", timing=untimed, others=(), contradiction=contradiction)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able, for the diagnostics of a result."""

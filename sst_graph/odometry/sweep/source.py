@@ -13,7 +13,7 @@ from sst_graph.data.frame_parts import (
 )
 from sst_graph.data.source_view import SourceView
 from sst_graph.errors import ConfigError
-from sst_graph.odometry.sweep.decision import SweepDecision, decide_sweep
+from sst_graph.odometry.sweep.decision import CLAIMS, SweepDecision, decide_sweep
 from sst_graph.sweep_timing import SweepStamp, SweepTiming
 from sst_graph.types import Frame, Scan, Source
 
@@ -56,8 +56,9 @@ def timed(scan: Scan, timing: SweepTiming) -> Scan:
 def with_sweep(source: Source, decide: bool = True) -> SweptSource:
     """The source with times for its points, decided from its scans; scans read for that are not read again.
 
-    Nothing is decided, and the source stays as it is, where its scans have times, or where it was opened
-    with a given sweep (its attribute ``sweep`` is other than "auto").
+    Where its scans have times, nothing is decided, and the source stays as it is. So it does where it was
+    opened with a given sweep (its attribute ``sweep`` is other than "auto"); what is said of it by a word of
+    ``--sweep`` is compared with the scans.
 
     Args:
         decide: False leaves scans without times as they are.
@@ -67,22 +68,30 @@ def with_sweep(source: Source, decide: bool = True) -> SweptSource:
     """
     if isinstance(source, SweptSource):
         return source
-    given = SweepDecision("given", SweepTiming(0.0, 0.0, 0.1))
-    if not decide or getattr(source, "sweep", "auto") != "auto":
+    given, word = SweepDecision("given", SweepTiming(0.0, 0.0, 0.1)), getattr(source, "sweep", "auto")
+    if not decide or word not in ("auto", *CLAIMS):
         return SweptSource(source, given)
     ahead = AheadReader(source)
-    for position in range(len(source)):
-        # A scan without points has no times of them either.
-        if (scan := ahead.look(position)) is not None and len(scan.points):
-            if scan.offsets_s is not None:
-                return SweptSource(source, given, ahead)
-            break
+    if word == "auto" and _has_times(ahead):
+        return SweptSource(source, given, ahead)
     stamp: SweepStamp = getattr(source, "sweep_stamp", "forward")
     # Where frames have one sensor each, scans follow one another at positions that do not.
     positions = scan_positions(source)
-    decision = decide_sweep(lambda k: ahead.look(positions[k]), len(positions), stamp)
-    frames = tuple(positions[k] for k in decision.frames)
-    return SweptSource(source, replace(decision, frames=frames), ahead)
+    decision = decide_sweep(lambda k: _without_times(ahead.look(positions[k])), len(positions), stamp)
+    decision = replace(decision, frames=tuple(positions[k] for k in decision.frames))
+    return SweptSource(source, decision if word == "auto" else decision.given_as(word), ahead)
+
+
+def _has_times(ahead: AheadReader) -> bool:
+    """Whether the first scan with points has times of them; one without points has none either."""
+    for position in range(len(ahead.source)):
+        if (scan := ahead.look(position)) is not None and len(scan.points):
+            return scan.offsets_s is not None
+    return False
+
+
+def _without_times(scan: Scan | None) -> Scan | None:
+    return None if scan is None else replace(scan, offsets_s=None)
 
 
 def with_sweep_of(source: Source, diagnostics: Mapping[str, Any]) -> SweptSource:

@@ -35,7 +35,7 @@ from sst_graph.tracker.start.first_estimate import StartGuess
 from sst_graph.tracker.start.initializer import Restart
 from sst_graph.tracker.sums.linearized_pair import LinearizedPair
 from sst_graph.tracker.window.gaussian import Point
-from sst_graph.tracker.window.matcher import WindowMatcher
+from sst_graph.tracker.window.matcher import InView, WindowMatcher
 
 _KERNEL = RobustKernel("geman_mcclure", 12.0)
 """Kernel of the comparison [px]: wide enough for matches to survive a turn of the camera by 1 degree."""
@@ -52,6 +52,11 @@ _LOST_FRAMES = 8
 is larger than the range of the matches."""
 _LOST_SHARE = 0.12
 """Largest fraction of the boundary points in view that counts as almost none."""
+_LACKING = 3.0
+"""Contours per boundary point in view that are so many times shorter than usual: labels are missing."""
+_MISSING_LABELS = "what ought to be in view has no labels in the images: those of some objects are missing"
+_USUAL_SHOWN = 60
+"""Frames whose contours say what is usual."""
 _LEAST_IN_VIEW = 16
 """Boundary points of an object in view; with fewer, it can happen by chance that none meets a contour."""
 _START_CHI2 = 15.0
@@ -120,6 +125,7 @@ class ChangeDetector:
         self._before: deque[Reference] = deque(maxlen=FRAMES)
         self._latest: deque[tuple[Reference, LinearizedPair]] = deque(maxlen=_MAX_PENDING_FRAMES)
         self._unmatched: deque[tuple[bool, frozenset[int]]] = deque(maxlen=_LOST_FRAMES)
+        self._shown: deque[tuple[int, int]] = deque(maxlen=_USUAL_SHOWN)
         self._moving: set[int] = set()
 
     def restart(self) -> None:
@@ -270,7 +276,9 @@ class ChangeDetector:
         self.confirmation.wait(seconds, speed_mps > _CONFIRM_SPEED_MPS)
         # Objects that moved lately are left out: one that starts or stops may pass for one that is static.
         self._moving = set(self.matcher.window.dynamics.recently_moving())
-        new = [scan for scan in waiting if scan not in self.scans]
+        # What is older than all that is remembered may have been compared before.
+        first = self.matcher.window.next_scan - _MAX_PENDING_FRAMES
+        new = [scan for scan in waiting if scan >= first and scan not in self.scans]
         if not new:
             return None
         # 1. Of scans with an image: do the objects in view meet its labels?
@@ -307,9 +315,11 @@ class ChangeDetector:
             chi2: the statistic of the latest frames.
         """
         self.suspected_change = ""
-        if self.lost:
+        if self.far and self._lacking:
+            self.suspected_change = _MISSING_LABELS
+        elif self.lost:
             return self._restart(estimate.point, _LOST_FRAMES, chi2)
-        if self.statistic.confirmed:
+        elif self.statistic.confirmed:
             if self.reference is not None and self._contradicted(self.reference, estimate):
                 return self._restart(self.reference.point, self.statistic.exceeded, chi2)
             self.suspected_change = "a single object contradicts the calibration: a step, or wrong labels"
@@ -345,12 +355,23 @@ class ChangeDetector:
         earlier = [before for before in known if before.scan <= scan]
         return earlier[-1].point if earlier else known[0].point if known else None
 
-    def _note_unmatched(self, views: Mapping[int, Mapping[int, int]], matches: Mapping[int, int]) -> None:
-        """views: boundary points in view, by scan and track."""
-        for scan, counts in views.items():
-            large = frozenset(track for track, count in counts.items() if count >= _LEAST_IN_VIEW)
+    def _note_unmatched(self, views: Mapping[int, InView], matches: Mapping[int, int]) -> None:
+        for scan, view in views.items():
+            large = frozenset(track for track, count in view.counts.items() if count >= _LEAST_IN_VIEW)
             if large:
-                self._unmatched.append((matches.get(scan, 0) < _LOST_SHARE * sum(counts.values()), large))
+                points = sum(view.counts.values())
+                self._unmatched.append((matches.get(scan, 0) < _LOST_SHARE * points, large))
+                self._shown.append((points, view.contour_px))
+
+    @property
+    def _lacking(self) -> bool:
+        """Whether the latest frames show much less of the labels' contours for what ought to be in view than
+        those before."""
+        points, contours = np.array(self._shown, float).reshape(-1, 2).T
+        now = slice(-len(self._unmatched), None)
+        before = slice(None, -len(self._unmatched))
+        usual = contours[before].sum() / max(points[before].sum(), 1.0)
+        return bool(_LACKING * contours[now].sum() < usual * points[now].sum())
 
     def _is_unmatched(self, frames: int) -> bool:
         """Whether so many of the latest frames, but for one of them, do not meet the labels."""

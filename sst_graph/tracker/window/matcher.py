@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from sst_graph.drive.preparation import Drive, boundaries_of, boundary_count
 from sst_graph.drive.twists import GrowingTwists
 from sst_graph.factors import alignment_cost
 from sst_graph.factors.robust import RobustKernel
+from sst_graph.features.mask_contour import ContourMap
 from sst_graph.graph.matching import (
     DYNAMIC_REACH_M,
     GraphConfig,
@@ -36,6 +37,19 @@ _MIN_MATCHES = 8
 """Fewest matches of a scan that enters the graph: fewer hardly determine anything."""
 _SMOOTHED = 12
 """So many of the latest motions are smoothed again with every scan."""
+
+
+@dataclass(frozen=True)
+class InView:
+    """What should be visible of a scan in its image.
+
+    Attributes:
+        counts: boundary points of each object, by its track.
+        contour_px: length of all contours that the image's labels have [px].
+    """
+
+    counts: Mapping[int, int]
+    contour_px: int
 
 
 class WindowMatcher:
@@ -125,14 +139,11 @@ class WindowMatcher:
 
     def in_view(
         self, point: Point, chosen: Collection[int], without: Collection[int]
-    ) -> dict[int, dict[int, int]]:
-        """How many boundary points of each object of scans that have an image should be visible in it.
+    ) -> dict[int, InView]:
+        """What should be visible of the objects of scans that have an image, by the scan's number.
 
         Args:
             without: tracks of objects that do not count.
-
-        Returns:
-            By the scan's number and the object's track.
         """
         part, numbers = self.window.drive(chosen.__contains__)
         found = {}
@@ -150,7 +161,9 @@ class WindowMatcher:
                     seen = np.bincount(inside) if len(inside) else np.zeros(0, np.intp)
                     tracks = self.window.tracks[number]
                     counts.update({tracks[c, o]: int(seen[o]) for o in np.flatnonzero(seen).tolist()})
-            found[number] = {track: count for track, count in counts.items() if track not in without}
+            kept = {track: count for track, count in counts.items() if track not in without}
+            shown = sum(m.contour_px for m in contours.values() if isinstance(m, ContourMap))
+            found[number] = InView(kept, shown)
         return found
 
     def left_out(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import deque
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence, Sized
 
 import gtsam
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from sst_graph.batch.by_edges.parts import thinned_scan
 from sst_graph.batch.by_edges.problem import POINTS_A_SCAN
 from sst_graph.drive.preparation import Drive, ImageFeatures, ScanFeatures
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, count_of
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.objects.dynamic_objects import DynamicObject, DynamicObjectTest, dynamic_object_weights
 from sst_graph.objects.occupancy import ObjectName
@@ -120,6 +120,16 @@ class Window:
         if motion is None or motion.to_ns != self.last_stamp_ns:
             return seconds, 0.0
         return seconds, float(np.linalg.norm(motion.aTb.translation())) / seconds
+
+    def lacking_labels(self) -> str:
+        """That the latest images, or scans, show no object of the classes that are aligned while the other
+        sensor's do, in words; empty where both do, or none does, or edges are aligned."""
+        images = _without([image.contours for image in self.images])
+        scans = _without([scan.boundaries for _, scan in self.scans])
+        if self.edges or (images > 0) == (scans > 0):
+            return ""
+        count, what, other = (images, "image", "scans") if images else (scans, "scan", "images")
+        return f"the latest {count_of(count, what)} without labels of objects, which the {other} have"
 
     def leaving(self) -> list[int]:
         """The scans that leave when the next one comes, oldest first."""
@@ -280,3 +290,9 @@ class Window:
             labelled_ns=(frozenset(self.labelled_ns[0]), frozenset(self.labelled_ns[1])),
         )
         return drive, numbers
+
+
+def _without(shown: Sequence[Sized]) -> int:
+    """How many of the last ones are empty."""
+    filled = [k for k, own in enumerate(shown) if len(own)]
+    return len(shown) - 1 - filled[-1] if filled else len(shown)
