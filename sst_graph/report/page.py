@@ -12,6 +12,7 @@ import numpy as np
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.fit import CLOSE_PX, Fit, MatchedFrame
 from sst_graph.inspect.budget_text import budget_lines
+from sst_graph.inspect.considered import stored_assumptions
 from sst_graph.inspect.inspection import Inspection, inspect_result, strong_correlations
 from sst_graph.inspect.inspection_text import MOST_SENTENCES, advice_sentences, correlation_sentence
 from sst_graph.inspect.reasons import as_sentence, capitalized, short_reasons
@@ -304,12 +305,8 @@ def _background(inputs: ReportInputs, inspection: Inspection) -> str:
 
 def _assumptions(result: CalibrationResult) -> str:
     """A row an assumption: what the data say of its parameter, and the verdict."""
-    stored = result.diagnostics.get("assumptions")
-    rows = [
-        _assumption_row(name, entry)
-        for name, entry in (stored.items() if isinstance(stored, Mapping) else ())
-        if name in ASSUMPTIONS and isinstance(entry, Mapping)
-    ]
+    stored = stored_assumptions(result).items()
+    rows = [_assumption_row(name, entry) for name, entry in stored if name in ASSUMPTIONS]
     if not rows:
         return ""
     head = ("assumption", "by the data", "considered", "verdict", "what it would mean if it did not hold")
