@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from sst_graph.assumptions import ASSUMPTIONS
+from sst_graph.files.strict_json import json_able
 from sst_graph.fit import CLOSE_PX, Fit, MatchedFrame
 from sst_graph.inspect.budget_text import budget_lines
 from sst_graph.inspect.considered import stored_assumptions
@@ -295,8 +296,8 @@ def _background(inputs: ReportInputs, inspection: Inspection) -> str:
         correlation_table(result),
         bullets(sentences),
         grid(ellipse_charts(result, strong_correlations(result.covariance, 0.0))),
-        details("Settings", preformatted(json.dumps(_plain(result.config), indent=1))),
-        details("How the drives were read", preformatted(json.dumps(_plain(result.read_as), indent=1)))
+        details("Settings", preformatted(json.dumps(json_able(result.config), indent=1))),
+        details("How the drives were read", preformatted(json.dumps(json_able(result.read_as), indent=1)))
         if result.read_as
         else "",
         details("Versions", table(("package", "version"), versions)) if versions else "",
@@ -322,12 +323,3 @@ def _assumption_row(name: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
     held = "holds" if tested else "its effect is in the sigmas"
     said = f"contradicted: {ASSUMPTIONS[name].remedy}" if entry.get("contradicted") else held
     return name, found, part, said, ASSUMPTIONS[name].violation
-
-
-def _plain(value: Any) -> Any:
-    """What JSON can hold."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
-    return value if value is None or isinstance(value, str | int | float | bool) else str(value)
