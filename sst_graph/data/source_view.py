@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any, Self, overload
 
 import gtsam
 
@@ -74,3 +77,53 @@ class SourceView(ABC):
     def read_image(self, position: int) -> CameraImage | None:
         """Image of the frame at a position."""
         return image_at(self.source, position)
+
+
+class ChangedSource(SourceView):
+    """A view whose scans or images are changed one by one as they are read; so are those of a slice of it.
+
+    What else the source has to say (of its sweep, its topics) is passed on.
+    """
+
+    def changed_scan(self, scan: Scan) -> Scan:
+        """The scan as it is seen; by default as it is."""
+        return scan
+
+    def changed_image(self, image: CameraImage) -> CameraImage:
+        """The image as it is seen; by default as it is."""
+        return image
+
+    @overload
+    def __getitem__(self, position: int) -> Frame: ...
+    @overload
+    def __getitem__(self, position: slice) -> Self: ...
+    def __getitem__(self, position: int | slice) -> Frame | Self:
+        """Frame at a position, or the drive restricted to a slice; errors as the source's own."""
+        if isinstance(position, slice):
+            part = copy.copy(self)
+            part.source = self.source[position]  # type: ignore[index, assignment]
+            return part
+        return self._changed(self.source[position])
+
+    def __iter__(self) -> Iterator[Frame]:
+        return map(self._changed, self.source)
+
+    def read_scan(self, position: int) -> Scan | None:
+        """Changed scan of the frame at a position."""
+        scan = scan_at(self.source, position)
+        return None if scan is None else self.changed_scan(scan)
+
+    def read_image(self, position: int) -> CameraImage | None:
+        """Changed image of the frame at a position."""
+        image = image_at(self.source, position)
+        return None if image is None else self.changed_image(image)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or name == "source":
+            raise AttributeError(name)
+        return getattr(self.source, name)
+
+    def _changed(self, frame: Frame) -> Frame:
+        scan = None if frame.scan is None else self.changed_scan(frame.scan)
+        image = None if frame.image is None else self.changed_image(frame.image)
+        return replace(frame, scan=scan, image=image)

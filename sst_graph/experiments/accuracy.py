@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,9 @@ from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drive
 from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import Progress
 from sst_graph.errors import ConfigError
-from sst_graph.experiments.starts import start_near
-from sst_graph.metrics import CalibrationErrors, calibration_errors
+from sst_graph.experiments.markdown import median_worst, status_counts, table
+from sst_graph.experiments.starts import errors_of, start_near
+from sst_graph.metrics import CalibrationErrors
 from sst_graph.result import Status
 from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.types import SemanticClass
@@ -107,7 +109,7 @@ def run(config: AccuracyConfig, progress: Progress | None = None) -> str:
     """
     if config.calibration.method not in ("auto", "joint"):
         raise ConfigError(f"accuracy is about the joint method, found {config.calibration.method}")
-    rows = [_HEADER, _RULE]
+    rows = []
     for name in config.scenarios:
         outcomes: list[Outcome] = []
         for street in range(config.streets):
@@ -115,7 +117,7 @@ def run(config: AccuracyConfig, progress: Progress | None = None) -> str:
             if progress is not None:
                 progress(name, street + 1, config.streets)
         rows.append(_row(SCENARIOS[name], outcomes))
-    return "\n".join(rows) + "\n"
+    return table(_HEADER, rows)
 
 
 def _street(scenario: Scenario, config: AccuracyConfig, seed: int) -> list[Outcome]:
@@ -129,9 +131,7 @@ def _street(scenario: Scenario, config: AccuracyConfig, seed: int) -> list[Outco
     for _ in range(scenario.starts):
         start = start_near(drive.truth.cTl, config.start_deg, config.start_m, rng) if scenario.guess else None
         result = calibrate_prepared(prepared, start, calibration)
-        errors = calibration_errors(
-            result.T_camera_lidar, result.time_offset_s, drive.truth, result.covariance
-        )
+        errors = errors_of(result, drive.truth)
         outcomes.append(Outcome(errors, result.status, errors.qad_deg > config.failed_deg))
     return outcomes
 
@@ -141,29 +141,28 @@ _HEADER = (
     "| time offset [ms] median / p95 | NEES rotation, translation (of 3), all (of 7) "
     "| ok / unobservable / not converged |"
 )
-_RULE = "|---|---|---|---|---|---|---|---|"
 
 
-def _row(scenario: Scenario, outcomes: Sequence[Outcome]) -> str:
+def _row(scenario: Scenario, outcomes: Sequence[Outcome]) -> list[str]:
     """A row; medians and percentiles are over all runs, failed ones included."""
     failed = [outcome for outcome in outcomes if outcome.failed]
     silent = sum(outcome.status == "ok" for outcome in failed)
     errors = [outcome.errors for outcome in outcomes]
-    rotation = _spread([e.qad_deg for e in errors], 3)
-    translation = _spread([100.0 * e.atd_m for e in errors], 2)
+    worst = partial(np.percentile, q=95)
+    rotation = median_worst([e.qad_deg for e in errors], 3, worst)
+    translation = median_worst([100.0 * e.atd_m for e in errors], 2, worst)
     standing = scenario.drive.get("motion") == "standing"
-    time_offset = "–" if standing else _spread([1e3 * abs(e.time_offset_s or 0.0) for e in errors], 2)
-    cells = [
+    time_offset = [1e3 * abs(e.time_offset_s or 0.0) for e in errors if not standing]
+    return [
         scenario.title,
         str(len(outcomes)),
         f"{len(failed)} ({silent})",
         rotation,
         translation,
-        time_offset,
+        median_worst(time_offset, 2, worst),
         mean_nees(errors),
         status_counts([outcome.status for outcome in outcomes]),
     ]
-    return "| " + " | ".join(cells) + " |"
 
 
 def mean_nees(errors: Sequence[CalibrationErrors]) -> str:
@@ -171,12 +170,3 @@ def mean_nees(errors: Sequence[CalibrationErrors]) -> str:
     nees = [e.nees for e in errors if e.nees is not None]
     means = [np.mean([getattr(n, part) for n in nees]) for part in ("rotation", "translation", "joint")]
     return ", ".join(f"{mean:.1f}" for mean in means)
-
-
-def status_counts(statuses: Sequence[str]) -> str:
-    """How many are ok, unobservable and not converged."""
-    return " / ".join(str(statuses.count(s)) for s in ("ok", "unobservable", "not_converged"))
-
-
-def _spread(values: Sequence[float], digits: int) -> str:
-    return f"{np.median(values):.{digits}f} / {np.percentile(values, 95):.{digits}f}"

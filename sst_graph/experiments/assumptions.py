@@ -13,8 +13,10 @@ from sst_graph.config import Settings, setting
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import Progress
 from sst_graph.errors import ConfigError, count_of
+from sst_graph.experiments import markdown
 from sst_graph.experiments.starts import error_of
 from sst_graph.experiments.wrong_drives import WRONG, with_line_delay
+from sst_graph.metrics import nees
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
 from sst_graph.types import FloatArray
 
@@ -103,7 +105,7 @@ class Run:
     @property
     def nees(self) -> float:
         """Normalised error squared over its dimension."""
-        return float(self.error @ np.linalg.solve(self.covariance, self.error)) / len(self.error)
+        return nees(self.error, self.covariance) / len(self.error)
 
     @property
     def worst_sigmas(self) -> float:
@@ -198,22 +200,13 @@ def table(runs: Sequence[Run], in_sigmas: bool = False) -> str:
     for one in runs:
         size = round(_told(one, sigmas), 6) if in_sigmas and one.size else abs(one.size)
         rows.setdefault((one.case, size), []).append(one)
-    lines = [_row(case, some, sigmas) for (case, _), some in rows.items()]
-    head = "| " + " | ".join(_COLUMNS) + " |\n|" + "---|" * len(_COLUMNS)
-    return "\n".join([head, *lines, "", *_summary(runs, sigmas)]) + "\n"
+    cells = (_row(case, some, sigmas) for (case, _), some in rows.items())
+    return "\n".join([markdown.table(_HEADER, cells), *_summary(runs, sigmas)]) + "\n"
 
 
-_COLUMNS = (
-    "broken",
-    "by ±",
-    "told [σ]",
-    "runs",
-    "contradicted",
-    "named first",
-    "not ok",
-    "silent",
-    "error [deg, cm, ms], median",
-    "NEES / dimension: median, mean",
+_HEADER = (
+    "| broken | by ± | told [σ] | runs | contradicted | named first | not ok | silent "
+    "| error [deg, cm, ms], median | NEES / dimension: median, mean |"
 )
 
 
@@ -222,15 +215,15 @@ def _told(one: Run, sigmas: Mapping[tuple[int, str], float]) -> float:
     return abs(one.size) / sigmas.get((one.seed, one.case), np.nan)
 
 
-def _row(case: str, runs: Sequence[Run], sigmas: Mapping[tuple[int, str], float]) -> str:
+def _row(case: str, runs: Sequence[Run], sigmas: Mapping[tuple[int, str], float]) -> list[str]:
     size = float(np.median([abs(one.size) for one in runs]))
     told = np.array([_told(one, sigmas) for one in runs])
     errors = np.array([one.error for one in runs])
     turn = np.degrees(np.median(np.linalg.norm(errors[:, :3], axis=1)))
     shift = 100.0 * np.median(np.linalg.norm(errors[:, 3:6], axis=1))
     offset = 1e3 * np.median(np.abs(errors[:, 6]))
-    nees = [one.nees for one in runs]
-    cells = [
+    normalised = [one.nees for one in runs]
+    return [
         case,
         f"{size:.3g}" if size else "–",
         f"{np.median(told):.1f}" if size and np.isfinite(told).all() else "–",
@@ -240,9 +233,8 @@ def _row(case: str, runs: Sequence[Run], sigmas: Mapping[tuple[int, str], float]
         str(sum(one.status != "ok" for one in runs)),
         str(sum(one.silent for one in runs)),
         f"{turn:.3f}, {shift:.2f}, {offset:.2f}",
-        f"{np.median(nees):.2f}, {np.mean(nees):.2f}",
+        f"{np.median(normalised):.2f}, {np.mean(normalised):.2f}",
     ]
-    return "| " + " | ".join(cells) + " |"
 
 
 def _summary(runs: Sequence[Run], sigmas: Mapping[tuple[int, str], float]) -> list[str]:

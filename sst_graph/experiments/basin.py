@@ -15,14 +15,13 @@ import numpy as np
 
 from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drives
 from sst_graph.config import Settings, setting
-from sst_graph.data import open_source
 from sst_graph.drive.preparation import Progress
 from sst_graph.errors import ConfigError, count_of
+from sst_graph.experiments.markdown import NONE, median, median_worst, status_counts, table
 from sst_graph.experiments.resumable import Work, rows_of
-from sst_graph.experiments.starts import truth_of
+from sst_graph.experiments.starts import drive_of, truth_of
 from sst_graph.metrics import calibration_errors
-from sst_graph.simulator import SimulationConfig, simulate
-from sst_graph.types import Source
+from sst_graph.simulator import SimulationConfig
 
 NEAR_DEG = 30.0
 """Starts closer than this stand in a row of their own [deg]: the default half width of the search."""
@@ -147,7 +146,7 @@ def _runs_of_drive(task: Task) -> list[BasinRun]:
         ConfigError: it brings no reference calibration.
     """
     config = task.config
-    source = _source(task)
+    source = drive_of(task.place, task.number, config)
     truth = truth_of(source)
     drives = prepare_drives([source], config.calibration)
     found = []
@@ -176,12 +175,6 @@ def _runs_of_drive(task: Task) -> list[BasinRun]:
                 )
             )
     return found
-
-
-def _source(task: Task) -> Source:
-    if task.place:
-        return open_source(task.place, image_shift=task.config.image_shift)
-    return simulate(dataclasses.replace(task.config.street, seed=task.config.seed + task.number))
 
 
 def start_anywhere(
@@ -223,53 +216,50 @@ def markdown(config: BasinConfig, runs: Sequence[BasinRun]) -> str:
         if config.data
         else f"{count_of(len(names), 'simulated street')} (seeds from {config.seed})"
     )
-    lines = [
+    conditions = (
         f"{over}; starts uniform over rotations within {config.start_deg:g}° of the truth and within "
         f"±{config.start_m:g} m by axis. Failed: QAD above {config.failed_deg:g}° or ATD above "
         f"{100.0 * config.failed_m:g} cm. Silent: failed and `ok`. In brackets: exact "
-        f"{100.0 * _CONFIDENCE:g} % bounds (Clopper–Pearson).",
-        "",
-        "| searched | starts | runs | failed | silent | ok / unobservable / not converged "
-        "| QAD of those not failed, median / worst [deg] | ATD [cm] | seconds, median |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+        f"{100.0 * _CONFIDENCE:g} % bounds (Clopper–Pearson)."
+    )
+    rows = []
     for search_deg, search_m in zip(config.searches_deg, config.searches_m, strict=True):
         own = [row for row in runs if row.search_deg == search_deg]
         near = [row for row in own if row.start_deg <= NEAR_DEG]
         label = f"±{search_deg:g}°, ±{search_m:g} m"
-        lines.append(_row(label, "all", own, config))
+        rows.append(_row(label, "all", own, config))
         if 0 < len(near) < len(own):
-            lines.append(_row(label, f"within {NEAR_DEG:g}°", near, config))
+            rows.append(_row(label, f"within {NEAR_DEG:g}°", near, config))
     if len(config.searches_deg) > 1:
-        lines.append(_row("all", "all", runs, config))
-    return "\n".join(lines) + "\n"
+        rows.append(_row("all", "all", runs, config))
+    return f"{conditions}\n\n{table(_HEADER, rows)}"
 
 
-def _row(searched: str, starts: str, runs: Sequence[BasinRun], config: BasinConfig) -> str:
+_HEADER = (
+    "| searched | starts | runs | failed | silent | ok / unobservable / not converged "
+    "| QAD of those not failed, median / worst [deg] | ATD [cm] | seconds, median |"
+)
+
+
+def _row(searched: str, starts: str, runs: Sequence[BasinRun], config: BasinConfig) -> list[str]:
     failed = [row for row in runs if row.failed(config)]
     good = [row for row in runs if not row.failed(config)]
     silent = sum(row.status == "ok" for row in failed)
-    counts = [sum(row.status == s for row in runs) for s in ("ok", "unobservable", "not_converged")]
-    cells = [
+    return [
         searched,
         starts,
         str(len(runs)),
         _share(len(failed), len(runs)),
         _share(silent, len(runs)),
-        " / ".join(map(str, counts)),
-        _median_worst([row.qad_deg for row in good], 3),
-        _median_worst([100.0 * row.atd_m for row in good], 1),
-        f"{np.median([row.seconds for row in runs]):.1f}" if runs else "–",
+        status_counts([row.status for row in runs]),
+        median_worst([row.qad_deg for row in good], 3),
+        median_worst([100.0 * row.atd_m for row in good], 1),
+        median([row.seconds for row in runs], 1),
     ]
-    return "| " + " | ".join(cells) + " |"
 
 
 def _share(count: int, of: int) -> str:
     if of == 0:
-        return "–"
+        return NONE
     low, high = binomial_bounds(count, of)
     return f"{count} ({100.0 * low:.2f}–{100.0 * high:.2f} %)"
-
-
-def _median_worst(values: Sequence[float], digits: int) -> str:
-    return f"{np.median(values):.{digits}f} / {np.max(values):.{digits}f}" if values else "–"

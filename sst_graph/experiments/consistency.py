@@ -12,7 +12,9 @@ from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drive
 from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import Progress
 from sst_graph.errors import ConfigError
+from sst_graph.experiments.markdown import table
 from sst_graph.experiments.starts import error_of, start_near
+from sst_graph.metrics import nees
 from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.types import FloatArray
 
@@ -75,8 +77,7 @@ class Run:
     def nees(self, part: slice) -> float:
         """Normalised estimation error squared of some of the seven, over their number."""
         some = self.judged(part)
-        square = self.error[some] @ np.linalg.solve(self.covariance[some, some], self.error[some])
-        return float(square / (some.stop - some.start))
+        return nees(self.error[some], self.covariance[some, some]) / float(some.stop - some.start)
 
 
 def run(
@@ -85,7 +86,7 @@ def run(
     drives: Mapping[str, tuple[str, Mapping[str, Any]]] = DRIVES,
 ) -> str:
     """A Markdown table, one row for every kind of drive and one for all; ``drives`` as :data:`DRIVES`."""
-    rows = [_HEADER, "|---|---|---|---|---|---|---|"]
+    rows = []
     everything: list[Run] = []
     for name in config.drives:
         title, drive = drives[name]
@@ -98,7 +99,7 @@ def run(
         everything += runs
     if len(config.drives) > 1:
         rows.append(row("all", everything, config.lost_deg))
-    return "\n".join(rows) + "\n"
+    return table(_HEADER, rows)
 
 
 def _run(drive: Mapping[str, Any], seed: int, config: ConsistencyConfig) -> Run:
@@ -120,7 +121,7 @@ _HEADER = (
 _PARTS = {"rotation": slice(0, 3), "translation": slice(3, 6), "time offset": slice(6, 7), "all": slice(0, 7)}
 
 
-def row(title: str, runs: Sequence[Run], lost_deg: float) -> str:
+def row(title: str, runs: Sequence[Run], lost_deg: float) -> list[str]:
     """A row of the table: runs that did not converge and wrong ones are counted and left out of the means."""
     claimed = [r for r in runs if not r.not_converged]
     kept = [r for r in claimed if np.degrees(np.linalg.norm(r.error[:3])) < lost_deg]
@@ -132,4 +133,4 @@ def row(title: str, runs: Sequence[Run], lost_deg: float) -> str:
             inside = [np.abs(r.error[part]) < 1.96 * np.sqrt(np.diag(r.covariance)[part]) for r in judged]
             cover.append(f"{100.0 * np.mean(inside):.0f} %")
     counts = f"{len(runs)} ({len(runs) - len(claimed)}, {len(claimed) - len(kept)})"
-    return "| " + " | ".join([title, counts, *cells, ", ".join(cover)]) + " |"
+    return [title, counts, *cells, ", ".join(cover)]

@@ -15,6 +15,7 @@ from sst_graph.data import open_source
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.drive.twists import camera_twist
 from sst_graph.errors import ConfigError
+from sst_graph.experiments.markdown import median, table
 from sst_graph.experiments.starts import start_near, truth_of
 from sst_graph.graph.matching import Tracks
 from sst_graph.metrics import CalibrationErrors, calibration_errors
@@ -55,7 +56,7 @@ def run(config: DrivesConfig, progress: Progress | None = None) -> str:
     """
     if not config.data:
         raise ConfigError("data: found none, expected folders, such as --set 'data=[\"DRIVE\"]'")
-    rows = [_HEADER, "|---|---|---|---|---|---|---|---|---|"]
+    rows = []
     for done, shift in enumerate(config.shifts):
         sources = [open_source(path, image_shift=shift) for path in config.data]
         drives = prepare_drives(sources, config.calibration)
@@ -65,7 +66,7 @@ def run(config: DrivesConfig, progress: Progress | None = None) -> str:
         rows += [_row(some, prepared, shift, config) for some, prepared in groups]
         if progress is not None:
             progress("drives", done + 1, len(config.shifts))
-    return "\n".join(rows) + "\n"
+    return table(_HEADER, rows)
 
 
 _HEADER = (
@@ -74,7 +75,7 @@ _HEADER = (
 )
 
 
-def _row(sources: Sequence[Source], drives: Sequence[Drive], shift: int, config: DrivesConfig) -> str:
+def _row(sources: Sequence[Source], drives: Sequence[Drive], shift: int, config: DrivesConfig) -> list[str]:
     """One drive, or several in one graph, from all starts."""
     truth = truth_of(sources[0])
     rng = np.random.default_rng([config.seed, shift])
@@ -82,19 +83,18 @@ def _row(sources: Sequence[Source], drives: Sequence[Drive], shift: int, config:
     for _ in range(config.starts):
         start = start_near(truth.cTl, config.start_deg, config.start_m, rng)
         results.append(calibrate_prepared(drives, start, config.calibration))
-    errors = [calibration_errors(r.T_camera_lidar, r.time_offset_s, truth, None) for r in results]
-    cells = [
+    errors = [calibration_errors(r.T_camera_lidar, r.time_offset_s, truth) for r in results]
+    return [
         " + ".join(source.name for source in sources),
         str(shift),
         str(len(results)),
         f"{_spread_deg(results):.3f}",
-        _median([e.qad_deg for e in errors], 3),
-        _median([100.0 * e.atd_m for e in errors], 2),
-        _median([1e3 * (e.time_offset_s or 0.0) for e in errors], 1),
-        _median([100.0 * _along(r, e, truth, drives[0]) for r, e in zip(results, errors, strict=True)], 1),
+        median([e.qad_deg for e in errors], 3),
+        median([100.0 * e.atd_m for e in errors], 2),
+        median([1e3 * (e.time_offset_s or 0.0) for e in errors], 1),
+        median([100.0 * _along(r, e, truth, drives[0]) for r, e in zip(results, errors, strict=True)], 1),
         ", ".join(sorted({result.status for result in results})),
     ]
-    return "| " + " | ".join(cells) + " |"
 
 
 def _spread_deg(results: Sequence[CalibrationResult]) -> float:
@@ -114,7 +114,3 @@ def _along(result: CalibrationResult, errors: CalibrationErrors, truth: GroundTr
     speed = float(np.mean(forward)) if forward else 0.0
     shift = result.T_camera_lidar.translation() - truth.cTl.translation()
     return float(shift[2] - speed * (errors.time_offset_s or 0.0))
-
-
-def _median(values: Sequence[float], digits: int) -> str:
-    return f"{float(np.median(values)):.{digits}f}"

@@ -21,6 +21,7 @@ from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import Progress
 from sst_graph.edges.turns import turned_states
+from sst_graph.experiments.markdown import table
 from sst_graph.fit import FitQuality
 from sst_graph.graph.outer_loop import NARROW_KERNELS_PX, solve_joint
 from sst_graph.graph.state import State
@@ -64,19 +65,17 @@ class FitTableConfig(Settings):
 def run(config: FitTableConfig, progress: Progress | None = None) -> str:
     """The table, in Markdown."""
     head = _HEAD + _BY_CHANCE * (config.calibration.method == "edges")
-    rows, total = (
-        [f"{head}\n" + "|---" * (head.count("|") - 1) + "|"],
-        len(config.seeds) * len(config.label_noises),
-    )
+    rows: list[list[str]] = []
+    total = len(config.seeds) * len(config.label_noises)
     for noise in config.label_noises:
         for seed in config.seeds:
             rows.append(_row(config, seed, noise))
             if progress is not None:
-                progress("streets", len(rows) - 1, total)
-    return "\n".join(rows) + "\n"
+                progress("streets", len(rows), total)
+    return table(head, rows)
 
 
-def _row(config: FitTableConfig, seed: int, noise: float) -> str:
+def _row(config: FitTableConfig, seed: int, noise: float) -> list[str]:
     street = simulate(replace(config.street, seed=seed, label_noise=noise))
     truth = street.truth
     drives = prepare_drives([street], config.calibration)
@@ -100,7 +99,7 @@ def _row(config: FitTableConfig, seed: int, noise: float) -> str:
     if config.calibration.method == "edges":
         around = turned_states(state, config.calibration.seed)[:_TURNED]
         cells.append(_percent(float(np.mean([quality(at).share for at in around]))))
-    return "| " + " | ".join(cells) + " |"
+    return cells
 
 
 def _solved(problem: CalibrationProblem, start: State) -> State:

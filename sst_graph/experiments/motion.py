@@ -13,9 +13,10 @@ from sst_graph.batch import CalibrationConfig, calibrate_prepared
 from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import Progress, prepare_drive
 from sst_graph.errors import ConfigError
-from sst_graph.experiments.accuracy import mean_nees, status_counts
-from sst_graph.experiments.starts import start_near
-from sst_graph.metrics import CalibrationErrors, calibration_errors
+from sst_graph.experiments.accuracy import mean_nees
+from sst_graph.experiments.markdown import median, median_worst, status_counts, table
+from sst_graph.experiments.starts import errors_of, start_near
+from sst_graph.metrics import CalibrationErrors
 from sst_graph.result import Status
 from sst_graph.simulator import SimulationConfig, simulate
 
@@ -90,7 +91,7 @@ def run(
         outcomes_of: of the name of a drive and the number of a street; :func:`street_outcomes` by default.
     """
     outcomes_of = outcomes_of or street_outcomes
-    rows = [_HEADER, _RULE]
+    rows = []
     for name in config.drives:
         outcomes: list[Outcome] = []
         for number in range(config.streets):
@@ -98,7 +99,7 @@ def run(
             if progress is not None:
                 progress(name, number + 1, config.streets)
         rows += [_row(name, label, [o for o in outcomes if o.run == label]) for label in RUNS]
-    return "\n".join(rows) + "\n"
+    return table(_HEADER, rows)
 
 
 def street_outcomes(config: MotionTableConfig, name: str, number: int) -> list[Outcome]:
@@ -115,9 +116,7 @@ def street_outcomes(config: MotionTableConfig, name: str, number: int) -> list[O
     for label, (guessed, settings) in RUNS.items():
         calibration = dataclasses.replace(config.calibration, **settings)
         result = calibrate_prepared([drive], start if guessed else None, calibration)
-        errors = calibration_errors(
-            result.T_camera_lidar, result.time_offset_s, source.truth, result.covariance
-        )
+        errors = errors_of(result, source.truth)
         outcomes.append(Outcome(label, errors, result.status, result.diagnostics["seconds"]["estimate"]))
     return outcomes
 
@@ -127,23 +126,17 @@ _HEADER = (
     "| time offset [ms] median / worst | NEES rotation, translation (of 3), all (of 7) "
     "| ok / unobservable / not converged | seconds |"
 )
-_RULE = "|---|---|---|---|---|---|---|---|"
 
 
-def _row(name: str, label: str, outcomes: Sequence[Outcome]) -> str:
+def _row(name: str, label: str, outcomes: Sequence[Outcome]) -> list[str]:
     errors = [outcome.errors for outcome in outcomes]
-    cells = [
+    return [
         name,
         label,
-        _spread([e.qad_deg for e in errors], 3),
-        _spread([100.0 * e.atd_m for e in errors], 2),
-        _spread([1e3 * abs(e.time_offset_s or 0.0) for e in errors], 2),
+        median_worst([e.qad_deg for e in errors], 3),
+        median_worst([100.0 * e.atd_m for e in errors], 2),
+        median_worst([1e3 * abs(e.time_offset_s or 0.0) for e in errors], 2),
         mean_nees(errors),
         status_counts([outcome.status for outcome in outcomes]),
-        f"{np.median([o.seconds for o in outcomes]):.1f}",
+        median([o.seconds for o in outcomes], 1),
     ]
-    return "| " + " | ".join(cells) + " |"
-
-
-def _spread(values: Sequence[float], digits: int) -> str:
-    return f"{np.median(values):.{digits}f} / {np.max(values):.{digits}f}"

@@ -14,6 +14,7 @@ from sst_graph.batch import CalibrationConfig
 from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import Progress
 from sst_graph.experiments.starts import error_of
+from sst_graph.metrics import nees
 from sst_graph.rig.adjustment import adjusted
 from sst_graph.rig.calibrate import calibrate_rig_prepared, prepare_rig
 from sst_graph.rig.influences import UNKNOWNS
@@ -143,7 +144,7 @@ def _errors(marginal: RigMarginal, truths: Sequence[GroundTruth]) -> FloatArray:
 
 def _nees(error: FloatArray, covariance: FloatArray) -> float:
     """Normalised estimation error squared over its dimension."""
-    return float(error @ np.linalg.solve(covariance, error)) / len(error)
+    return nees(error, covariance) / len(error)
 
 
 def _block(marginal: RigMarginal, camera: int) -> FloatArray:

@@ -20,6 +20,7 @@ from sst_graph.batch import CalibrationConfig, calibrate_prepared
 from sst_graph.config import Settings, setting
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import Progress, prepare_drive
+from sst_graph.experiments.markdown import table
 from sst_graph.experiments.slam_graph import (
     EXTRINSIC,
     TIME_OFFSET,
@@ -172,15 +173,15 @@ def calibration_errors(cTl: gtsam.Pose3, time_offset_s: float, source: Simulated
 
 def markdown(config: SlamConfig, streets: Sequence[Street]) -> str:
     """The table: a row for each weather and way, and one of how often both together are better."""
-    rows = ["| weather | | " + " | ".join(MEASURES) + " |", "|---" * (2 + len(MEASURES)) + "|"]
+    rows = []
     for weather in config.weathers:
         chosen = [street for street in streets if street.weather == weather]
         for row in ROWS:
             cells = [_median(chosen, row, name, digits) for name, digits in MEASURES.items()]
-            rows.append(" | ".join([f"| {weather}", row, *cells]) + " |")
+            rows.append([weather, row, *cells])
         cells = [_better(chosen, name) for name in MEASURES]
-        rows.append(" | ".join([f"| {weather}", "both better", *cells]) + " |")
-    return "\n".join(rows) + "\n"
+        rows.append([weather, "both better", *cells])
+    return table("| weather | | " + " | ".join(MEASURES) + " |", rows)
 
 
 def _median(streets: Sequence[Street], row: str, name: str, digits: int) -> str:

@@ -12,19 +12,17 @@ import numpy as np
 from sst_graph.association.edge_matching import MatchConfig
 from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import Drive
-from sst_graph.drive.twists import SensorTwists
 from sst_graph.factors import (
-    Between,
     CameraMotion,
     GroupedBias,
-    RobustKernel,
     camera_motion_factor,
     pose_alignment_factor,
     time_offset_prior,
 )
 from sst_graph.objects.tracks import ObjectId, object_tracks
 from sst_graph.odometry import LoopClosure, metric_motions
-from sst_graph.slam.align import CameraCalibration, FrameMatching, ScanMotion, align_frame
+from sst_graph.slam.alignment_keys import AlignmentKeys, Trajectory
+from sst_graph.slam.alignment_term import AlignmentTerm, TermConfig, TermMatches, TermPlace
 from sst_graph.types import Calibration, FloatArray, RelativeMotion, SemanticClass
 
 EXTRINSIC, TIME_OFFSET, BIAS = (int(gtsam.symbol(letter, 0)) for letter in "EDB")
@@ -111,53 +109,21 @@ def with_camera(
     values.insert(EXTRINSIC, start.cTl)
     values.insert(TIME_OFFSET, np.array([start.time_offset_s]))
     values.insert(BIAS, np.zeros(1))
+    stamps = drive.scan_stamps_ns
+    trajectory = Trajectory([pose_key(k) for k in range(len(stamps))], stamps)
+    keys = AlignmentKeys(trajectory, EXTRINSIC, TIME_OFFSET, {VEHICLE: BIAS})
+    settings = TermConfig(match=config.match, min_matches=1)
+    terms = [AlignmentTerm(drive.scans, image, drive.camera, keys, settings) for image in drive.images]
     for kernel_px in config.kernel_px:
-        places = _places(drive, values)
         whole = gtsam.NonlinearFactorGraph(graph)
         _add_priors(whole, nominal, config)
         if config.silhouettes:
-            silhouettes = _Silhouettes(drive, tracks, places, kernel_px)
-            values = _add_silhouettes(whole, values, silhouettes, config)
+            matches = [term.matched(values, kernel_px) for term in terms]
+            values = _add_silhouettes(whole, values, matches, tracks, config)
         if config.visual_odometry:
-            _add_visual_odometry(whole, values, drive, places, config)
+            _add_visual_odometry(whole, values, drive, terms, config)
         values = gtsam.LevenbergMarquardtOptimizer(whole, values).optimize()
     return values
-
-
-@dataclass(frozen=True)
-class _Place:
-    """Where an image falls in the trajectory.
-
-    Attributes:
-        scan: position of the scan before it.
-        between: the poses around it.
-        twist, acceleration: (6,) of the LiDAR at its instant [rad/s, m/s], [rad/s^2, m/s^2].
-    """
-
-    scan: int
-    between: Between
-    twist: FloatArray
-    acceleration: FloatArray
-
-
-def _places(drive: Drive, values: gtsam.Values) -> list[_Place]:
-    """Every image's place under the present estimate."""
-    stamps = drive.scan_stamps_ns
-    poses = [values.atPose3(pose_key(k)) for k in range(len(stamps))]
-    motions = [
-        RelativeMotion(stamps[k], stamps[k + 1], a.between(b), np.eye(6))
-        for k, (a, b) in enumerate(itertools.pairwise(poses))
-    ]
-    twists, offset_ns = SensorTwists(motions), round(1e9 * float(values.atVector(TIME_OFFSET)[0]))
-    places = []
-    for stamp_ns in drive.image_stamps_ns:
-        true_ns = stamp_ns + offset_ns
-        scan = int(np.clip(np.searchsorted(stamps, true_ns, "right") - 1, 0, len(stamps) - 2))
-        seconds = (stamps[scan + 1] - stamps[scan]) * 1e-9
-        between = Between(pose_key(scan), pose_key(scan + 1), seconds, (stamp_ns - stamps[scan]) * 1e-9)
-        sample = twists.at(true_ns)
-        places.append(_Place(scan, between, sample.twist, sample.acceleration))
-    return places
 
 
 def _add_priors(graph: gtsam.NonlinearFactorGraph, nominal: gtsam.Pose3, config: CameraGraphConfig) -> None:
@@ -167,51 +133,26 @@ def _add_priors(graph: gtsam.NonlinearFactorGraph, nominal: gtsam.Pose3, config:
     graph.add(time_offset_prior(BIAS, 0.0, config.bias_sigma_px))
 
 
-@dataclass(frozen=True)
-class _Silhouettes:
-    """What is matched in a round.
-
-    Attributes:
-        drive: its scans and images.
-        tracks: of their objects.
-        places: of the images.
-        kernel_px: scale of the robust kernel [px].
-    """
-
-    drive: Drive
-    tracks: Mapping[ObjectId, int]
-    places: Sequence[_Place]
-    kernel_px: float
-
-
 def _add_silhouettes(
     graph: gtsam.NonlinearFactorGraph,
     values: gtsam.Values,
-    silhouettes: _Silhouettes,
+    matches: Sequence[TermMatches],
+    tracks: Mapping[ObjectId, int],
     config: CameraGraphConfig,
 ) -> gtsam.Values:
-    """Every image aligned with the scan before it, with a mask bias for each object; the values then."""
-    drive, seen = silhouettes.drive, set[int]()
-    calibration = CameraCalibration(
-        drive.camera,
-        values.atPose3(EXTRINSIC),
-        float(values.atVector(TIME_OFFSET)[0]),
-        {VEHICLE: float(values.atVector(BIAS)[0])},
-    )
-    kernel = RobustKernel("geman_mcclure", silhouettes.kernel_px)
-    matching = FrameMatching(kernel=kernel, config=config.match)
-    for image, place in zip(drive.images, silhouettes.places, strict=True):
-        motion = ScanMotion(place.twist, place.acceleration)
-        found = align_frame(drive.scans[place.scan], image, calibration, motion, matching)
-        if not len(found):
+    """The matches of every image, with a mask bias for each object; the values then."""
+    seen = set[int]()
+    for each in matches:
+        if each.place is None or not len(each):
             continue
-        tracks = [silhouettes.tracks[place.scan, VEHICLE, int(number)] for number in found.objects[0]]
-        of_match = [_object_key(track) for track in tracks]
+        numbers = np.concatenate(each.found.objects)
+        of_match = [_object_key(tracks[each.place.scan, VEHICLE, int(number)]) for number in numbers]
         keys, groups = np.unique(np.array(of_match, dtype=np.uint64), return_inverse=True)
         objects = [int(key) for key in keys]
         seen.update(objects)
         biases = GroupedBias(tuple(objects), groups)
-        graph.add(pose_alignment_factor(found.alignments, place.between, EXTRINSIC, TIME_OFFSET, biases))
+        between = each.place.between
+        graph.add(pose_alignment_factor(each.found.alignments, between, EXTRINSIC, TIME_OFFSET, biases))
     return _with_object_biases(graph, values, seen, config)
 
 
@@ -240,23 +181,28 @@ def _add_visual_odometry(
     graph: gtsam.NonlinearFactorGraph,
     values: gtsam.Values,
     drive: Drive,
-    places: Sequence[_Place],
+    terms: Sequence[AlignmentTerm],
     config: CameraGraphConfig,
 ) -> None:
-    """Motions of the camera, metric by the depth that the present calibration gives to its features."""
-    cTl, time_offset_s = values.atPose3(EXTRINSIC), float(values.atVector(TIME_OFFSET)[0])
+    """Motions of the camera, metric by the depth that the calibration in the values gives to its features."""
+    places = [term.place(values) for term in terms]
+    keys = terms[0].keys
 
     def depth(position: int) -> FloatArray:
         place = places[position]
-        tau = place.between.image_after_a_s + time_offset_s
-        cTscan = cTl * gtsam.Pose3.Expmap(-tau * place.twist)
-        lPs = drive.scans[place.scan].depth_lPs.astype(np.float64)
-        return np.asarray(cTscan.transformFrom(lPs.T)).T
+        if not isinstance(place, TermPlace):
+            return np.zeros((0, 3))
+        twist = keys.trajectory.twist(values, place.position)
+        assert twist is not None  # both poses are there
+        tau = place.between.image_after_a_s + keys.offset(values)
+        aTs = values.atPose3(place.between.X_a).between(values.atPose3(place.between.X_s))
+        cTs = keys.extrinsic(values) * gtsam.Pose3.Expmap(-tau * twist) * aTs
+        return np.asarray(cTs.transformFrom(drive.scans[place.scan].depth_lPs.astype(np.float64).T)).T
 
     motions = metric_motions(drive.image_pairs, drive.camera, depth)
     between = np.diag(np.repeat([config.between_rad, config.between_m], 3) ** 2)
     for (first, second), motion in zip(itertools.pairwise(places), motions, strict=True):
-        if motion.ok:
+        if motion.ok and isinstance(first, TermPlace) and isinstance(second, TermPlace):
             camera_motion = CameraMotion(motion.aTb, motion.covariance + between)
             ends = first.between, second.between
             graph.add(camera_motion_factor(*ends, EXTRINSIC, TIME_OFFSET, camera_motion))

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Any
+
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.data import open_source
 from sst_graph.errors import ConfigError
+from sst_graph.metrics import CalibrationErrors, calibration_errors
+from sst_graph.result import CalibrationResult
+from sst_graph.simulator import simulate
 from sst_graph.types import GroundTruth, Source
 
 
@@ -25,6 +32,22 @@ def start_near(cTl: gtsam.Pose3, half_deg: float, half_m: float, rng: np.random.
     """The extrinsic with an error uniform by axis within half widths [deg], [m], in its tangent space."""
     turn = np.radians(half_deg) * rng.uniform(-1.0, 1.0, 3)
     return cTl.retract(np.concatenate([turn, half_m * rng.uniform(-1.0, 1.0, 3)]))
+
+
+def drive_of(place: str, number: int, config: Any) -> Source:
+    """The drive in a folder, or the street of a number where there is none.
+
+    Args:
+        config: of an experiment, with ``image_shift`` for folders, and ``street`` and ``seed`` for streets.
+    """
+    if place:
+        return open_source(place, image_shift=config.image_shift)
+    return simulate(dataclasses.replace(config.street, seed=config.seed + number))
+
+
+def errors_of(result: CalibrationResult, truth: GroundTruth) -> CalibrationErrors:
+    """Errors of a result, and its NEES."""
+    return calibration_errors(result.T_camera_lidar, result.time_offset_s, truth, result.covariance)
 
 
 def error_of(cTl: gtsam.Pose3, time_offset_s: float, truth: GroundTruth) -> NDArray[np.float64]:

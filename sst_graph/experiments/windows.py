@@ -13,6 +13,7 @@ from sst_graph.config import Settings, setting
 from sst_graph.data import open_source
 from sst_graph.drive.preparation import Progress
 from sst_graph.errors import ConfigError
+from sst_graph.experiments.markdown import table
 from sst_graph.metrics import CalibrationErrors, calibration_errors
 from sst_graph.result import CalibrationResult
 from sst_graph.types import FloatArray
@@ -48,14 +49,14 @@ def run(config: WindowsConfig, progress: Progress | None = None) -> str:
     """
     if not config.data:
         raise ConfigError("data: found none, expected folders, such as --set 'data=[\"DRIVE\"]'")
-    rows = [_HEADER, "|---|---|---|---|---|---|---|---|"]
+    rows = []
     together = [config.data] if len(config.data) > 1 else []
     for paths in [*((path,) for path in config.data), *together]:
         for done, count in enumerate(config.windows):
             rows.append(_row(paths, count, config))
             if progress is not None:
                 progress(" + ".join(paths), done + 1, len(config.windows))
-    return "\n".join(rows) + "\n"
+    return table(_HEADER, rows)
 
 
 _HEADER = (
@@ -65,7 +66,7 @@ _HEADER = (
 )
 
 
-def _row(paths: Sequence[str], count: int, config: WindowsConfig) -> str:
+def _row(paths: Sequence[str], count: int, config: WindowsConfig) -> list[str]:
     """Drives cut into ``count`` windows each; those of the same number go into one graph."""
     wholes = [open_source(path, image_shift=config.shift) for path in paths]
     edges = [np.linspace(0, len(whole), count + 1).round().astype(int) for whole in wholes]
@@ -79,10 +80,10 @@ def _row(paths: Sequence[str], count: int, config: WindowsConfig) -> str:
         results.append(result)
         truth = windows[0].truth
         if truth is not None and result.status != "not_converged":
-            errors.append(calibration_errors(result.T_camera_lidar, result.time_offset_s, truth, None))
+            errors.append(calibration_errors(result.T_camera_lidar, result.time_offset_s, truth))
     names = " + ".join(whole.name for whole in wholes)
     states = ", ".join(result.status for result in results)
-    return "| " + " | ".join([names, str(count), *spread_cells(results), error_cell(errors), states]) + " |"
+    return [names, str(count), *spread_cells(results), error_cell(errors), states]
 
 
 def error_cell(errors: Sequence[CalibrationErrors]) -> str:

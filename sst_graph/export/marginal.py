@@ -19,6 +19,7 @@ from sst_graph.errors import EstimationError, count_of
 from sst_graph.export.agreement import SIGNIFICANCE, check_agreement, check_apart
 from sst_graph.factors.arguments import checked_type
 from sst_graph.factors.errors import FactorError
+from sst_graph.inspect.considered import considered_errors
 from sst_graph.marginal import (
     EXTRINSIC,
     FORMAT,
@@ -82,15 +83,8 @@ def common_errors(result: CalibrationResult) -> dict[str, FloatArray]:
     All results of the same two sensors err by these together. Empty where the covariance does not hold them,
     such as one that a program has put in its place.
     """
-    entries = result.diagnostics.get("assumptions")
-    steps = {}
-    for name, entry in entries.items() if isinstance(entries, dict) else ():
-        try:
-            step = float(entry["sigma"]) * np.asarray(entry["sensitivity"], np.float64)
-        except (KeyError, TypeError, ValueError):
-            continue
-        if step.shape == (7,) and np.isfinite(step).all() and step.any():
-            steps[name] = step
+    errors = {name: sigma * sensitivity for name, (sigma, sensitivity) in considered_errors(result).items()}
+    steps = {name: step for name, step in errors.items() if step.any()}
     return {} if own_covariance(result.covariance, steps) is None else steps
 
 

@@ -11,6 +11,7 @@ from typing import Any, TypeGuard
 
 import gtsam
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sst_graph.errors import DataError
 from sst_graph.factors.arguments import described
@@ -68,6 +69,21 @@ def checked_pose(matrix: FloatArray, place: str) -> gtsam.Pose3:
         found = f"a translation of {np.abs(matrix[:3, 3]).max():.3g} m"
         raise DataError(place, found, f"metres between two sensors, at most {MAX_TRANSLATION_M:g}")
     return gtsam.Pose3(gtsam.Rot3.ClosestTo(R) if off > 1e-12 else gtsam.Rot3(R), matrix[:3, 3])
+
+
+def pose_by_quaternion(translation: ArrayLike, wxyz: ArrayLike, place: str) -> gtsam.Pose3:
+    """The pose of a translation (3,) [m] and a quaternion w x y z, whose length is 1 but for its digits.
+
+    Raises:
+        DataError: naming ``place``: another length, or as :func:`checked_pose`.
+    """
+    length = float(np.linalg.norm(wxyz))
+    if not abs(length - 1.0) < ROTATION_TOLERANCE:
+        raise DataError(place, f"a quaternion of length {length:.6g}", "1")
+    matrix = np.eye(4)
+    matrix[:3, :3] = gtsam.Rot3.Quaternion(*(np.asarray(wxyz) / length)).matrix()
+    matrix[:3, 3] = translation
+    return checked_pose(matrix, place)
 
 
 def is_number(value: Any) -> TypeGuard[float]:

@@ -6,12 +6,14 @@ import ast
 from collections.abc import Sequence
 
 import gtsam
+import numpy as np
 
 from sst_graph.data.ros.transforms import Transforms
 from sst_graph.errors import DataError, count_of
+from sst_graph.files.checked_values import pose_by_quaternion
 from sst_graph.files.yaml_file import number
 from sst_graph.imports.document import Document
-from sst_graph.imports.rotations import pose_by_quaternion, pose_by_rpy
+from sst_graph.imports.rotations import pose_by_rpy
 
 PUBLISHER = "static_transform_publisher"
 _FLAGS = ("x", "y", "z", "qx", "qy", "qz", "qw", "roll", "pitch", "yaw", "frame-id", "child-frame-id")
@@ -88,7 +90,7 @@ def _by_flags(words: Sequence[str], place: str) -> tuple[str, str, gtsam.Pose3]:
 
     parent, child, xyz = given["--frame-id"], given["--child-frame-id"], values("x y z")
     if by_quaternion:
-        return parent, child, pose_by_quaternion(xyz, values("qx qy qz qw"), child, place)
+        return parent, child, pose_by_quaternion(xyz, values("qw qx qy qz"), f"{place} ({child!r:.40})")
     return parent, child, pose_by_rpy(xyz, values("roll pitch yaw"), place)
 
 
@@ -101,7 +103,7 @@ def _by_position(words: Sequence[str], place: str) -> tuple[str, str, gtsam.Pose
     numbers = [number(word, place) for word in values]
     xyz, rotation = numbers[:3], numbers[3:]
     if len(rotation) == 4:
-        return parent, child, pose_by_quaternion(xyz, rotation, child, place)
+        return parent, child, pose_by_quaternion(xyz, np.roll(rotation, 1), f"{place} ({child!r:.40})")
     return parent, child, pose_by_rpy(xyz, rotation[::-1], place)
 
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import gtsam
 import numpy as np
 
-from sst_graph.data.nuscenes.tables import pose_of
 from sst_graph.files.checked_values import checked_pose
 from sst_graph.metrics import FORWARD_R_OPTICAL
 from sst_graph.types import FloatArray
@@ -49,15 +47,3 @@ def pose_by_rpy(xyz: Sequence[float], rpy: Sequence[float], place: str) -> gtsam
     matrix[:3, :3] = gtsam.Rot3.RzRyRx(np.array(rpy)).matrix()
     matrix[:3, 3] = xyz
     return checked_pose(matrix, place)
-
-
-def pose_by_quaternion(
-    xyz: Sequence[float], xyzw: Sequence[float], name: str, place: str | Path
-) -> gtsam.Pose3:
-    """Pose of a translation [m] and a quaternion x y z w.
-
-    Raises:
-        DataError: naming ``place`` and ``name``: no unit quaternion, or no translation between two sensors.
-    """
-    x, y, z, w = xyzw
-    return pose_of({"token": name, "translation": list(xyz), "rotation": [w, x, y, z]}, Path(place))

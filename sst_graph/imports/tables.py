@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from sst_graph.data.ros.transforms import Transforms
 from sst_graph.errors import DataError
+from sst_graph.files.checked_values import pose_by_quaternion
 from sst_graph.files.yaml_file import number
 from sst_graph.imports.document import Document
-from sst_graph.imports.rotations import pose_by_quaternion, pose_by_rpy
+from sst_graph.imports.rotations import pose_by_rpy
 
 _MOST = 10_000
 _POSE = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -45,7 +48,7 @@ def _add_message(found: Transforms, message: Any, place: str) -> None:
     translation, rotation = (_part(transform, name, place) for name in ("translation", "rotation"))
     xyz = [number(translation.get(name), f"{place} {name}") for name in "xyz"]
     xyzw = [number(rotation.get(name), f"{place} {name}") for name in "xyzw"]
-    found.add_pose(parent, child, pose_by_quaternion(xyz, xyzw, child, place))
+    found.add_pose(parent, child, pose_by_quaternion(xyz, np.roll(xyzw, 1), f"{place} ({child!r:.40})"))
 
 
 def is_sensor_kit(table: Mapping[str, Any]) -> bool:

@@ -10,6 +10,7 @@ from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.covariance.considered import BUDGET, SHIFTS
 from sst_graph.errors import printable
 from sst_graph.files.checked_values import is_number
+from sst_graph.inspect.considered import stored_assumptions
 from sst_graph.result import CalibrationResult
 from sst_graph.types import FloatArray
 
@@ -72,9 +73,7 @@ def _is_sigma(value: Any) -> bool:
 
 def _label(name: str, result: CalibrationResult) -> str:
     """An assumption and the deviation of its parameter that was considered."""
-    stored = result.diagnostics.get("assumptions")
-    entry = stored.get(name) if isinstance(stored, dict) else None
-    sigma = entry.get("sigma") if isinstance(entry, dict) else None
+    sigma = stored_assumptions(result).get(name, {}).get("sigma")
     if not _is_sigma(sigma):
         return name
     return f"{name} off by {sigma:.2g} {ASSUMPTIONS[name].unit}".rstrip()

@@ -6,7 +6,7 @@ the calibration with all its frames, so that they hold whatever scale its covari
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +30,7 @@ _ROUNDING = 6.0 * 10.0 ** (1 - DIGITS)
 a row, each off by half a unit of its last digit, and by as much again through the diagonal."""
 
 _UPPER = np.triu_indices(6)
+_PLACE = f"diagnostics.{KEY}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,19 +89,14 @@ def with_offset(view: FloatArray, l_twist: FloatArray) -> FloatArray:
 
 def to_document(frames: Sequence[FrameInformation]) -> dict[str, Any]:
     """JSON-able columns, rounded to :data:`DIGITS`; a view is its upper triangle, row by row."""
-    return {
+    document: dict[str, Any] = {
         "drive": [frame.frame.drive for frame in frames],
         "frame": [frame.frame.frame for frame in frames],
-        "bits": [_rounded(frame.bits) for frame in frames],
-        "without": [_rounded_all(frame.without) for frame in frames],
-        "so_far": [_rounded_all(frame.so_far) for frame in frames],
-        "view": [_rounded_all(frame.view[_UPPER]) for frame in frames],
-        "l_twist": [_rounded_all(frame.l_twist) for frame in frames],
-        "matches": [frame.matches for frame in frames],
-        "objects": [frame.objects for frame in frames],
-        "nearest_m": [_rounded(frame.nearest_m) for frame in frames],
-        "left": [_rounded(frame.left) for frame in frames],
     }
+    for name in _COLUMNS:
+        values = (getattr(frame, name) for frame in frames)
+        document[name] = [rounded(value[_UPPER] if name == "view" else value) for value in values]
+    return document
 
 
 def frames_of(result: CalibrationResult) -> tuple[FrameInformation, ...]:
@@ -113,62 +109,39 @@ def frames_of(result: CalibrationResult) -> tuple[FrameInformation, ...]:
     return () if document is None else from_document(document)
 
 
-def from_document(document: Any, place: str = f"diagnostics.{KEY}") -> tuple[FrameInformation, ...]:
+def from_document(document: Any) -> tuple[FrameInformation, ...]:
     """The inverse of :func:`to_document`.
 
     Raises:
         DataError: no such columns.
     """
     if not isinstance(document, Mapping):
-        raise DataError(place, type(document).__name__, "an object of columns")
+        raise DataError(_PLACE, type(document).__name__, "an object of columns")
     names, numbers = document.get("drive"), document.get("frame")
     if not isinstance(names, list) or not isinstance(numbers, list) or len(names) != len(numbers):
-        raise DataError(place, "no matching lists 'drive' and 'frame'", "one entry a frame in each")
+        raise DataError(_PLACE, "no matching lists 'drive' and 'frame'", "one entry a frame in each")
     n = len(names)
-    column = {
-        name: _column(document, name, (n, *shape), place)
-        for name, shape in {
-            "frame": (),
-            "bits": (),
-            "without": (7,),
-            "so_far": (7,),
-            "view": (len(_UPPER[0]),),
-            "l_twist": (6,),
-            "matches": (),
-            "objects": (),
-            "nearest_m": (),
-            "left": (),
-        }.items()
-    }
+    columns = [_column(document, "frame", (n,))]
+    for name, (shape, read) in _COLUMNS.items():
+        columns.append([read(value) for value in _column(document, name, (n, *shape))])
     return tuple(
-        FrameInformation(
-            FrameId(printable(names[k]), int(column["frame"][k])),
-            float(column["bits"][k]),
-            column["without"][k],
-            column["so_far"][k],
-            _symmetric(column["view"][k], f"{place}.view"),
-            column["l_twist"][k],
-            int(column["matches"][k]),
-            int(column["objects"][k]),
-            float(column["nearest_m"][k]),
-            float(column["left"][k]),
-        )
-        for k in range(n)
+        FrameInformation(FrameId(printable(drive), int(number)), *values)
+        for drive, number, *values in zip(names, *columns, strict=True)
     )
 
 
-def _column(document: Mapping[str, Any], name: str, shape: tuple[int, ...], place: str) -> FloatArray:
+def _column(document: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Any:
     try:
         array = np.array(document[name], dtype=np.float64).reshape(shape)
     except (KeyError, TypeError, ValueError):
-        raise DataError(f"{place}.{name}", "no such numbers", f"shape {shape}") from None
+        raise DataError(f"{_PLACE}.{name}", "no such numbers", f"shape {shape}") from None
     if not (np.abs(array) <= MAX_NUMBER).all():
         expected = f"finite numbers of at most {MAX_NUMBER:g}"
-        raise DataError(f"{place}.{name}", "a value that is not finite, or huge", expected)
+        raise DataError(f"{_PLACE}.{name}", "a value that is not finite, or huge", expected)
     return array
 
 
-def _symmetric(upper: FloatArray, place: str) -> FloatArray:
+def _symmetric(upper: FloatArray) -> FloatArray:
     """(6, 6) from its upper triangle; rounding may leave it a little indefinite, which is cut off.
 
     Raises:
@@ -177,7 +150,7 @@ def _symmetric(upper: FloatArray, place: str) -> FloatArray:
     A = np.zeros((6, 6))
     A[_UPPER] = upper
     A = A + np.triu(A, 1).T
-    expected = "information (positive semi-definite)"
+    place, expected = f"{_PLACE}.view", "information (positive semi-definite)"
     sigmas = np.sqrt(np.maximum(np.diag(A), 0.0))
     if (np.abs(A) > (1.0 + _ROUNDING) * np.outer(sigmas, sigmas)).any():
         raise DataError(place, "entries that their diagonal does not allow", expected)
@@ -212,9 +185,24 @@ def unit_diagonal(A: FloatArray) -> tuple[FloatArray, FloatArray]:
     return unit * np.outer(known, known), scale * known
 
 
-def _rounded(value: float) -> float:
-    return float(f"{value:.{DIGITS}g}")
+def rounded(value: Any) -> Any:
+    """A number or an array, to :data:`DIGITS`; None and whole numbers as they are."""
+    if value is None or isinstance(value, int):
+        return value
+    return (
+        float(f"{value:.{DIGITS}g}") if isinstance(value, float) else [rounded(float(one)) for one in value]
+    )
 
 
-def _rounded_all(values: FloatArray) -> list[float]:
-    return [_rounded(float(value)) for value in values]
+_COLUMNS: Mapping[str, tuple[tuple[int, ...], Callable[[Any], Any]]] = {
+    "bits": ((), float),
+    "without": ((7,), np.asarray),
+    "so_far": ((7,), np.asarray),
+    "view": ((len(_UPPER[0]),), _symmetric),
+    "l_twist": ((6,), np.asarray),
+    "matches": ((), int),
+    "objects": ((), int),
+    "nearest_m": ((), float),
+    "left": ((), float),
+}
+"""Attributes of a frame in the order of the class, with the shape of an entry and how it is read."""

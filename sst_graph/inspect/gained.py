@@ -17,7 +17,7 @@ import numpy as np
 from sst_graph.errors import DataError, printable
 from sst_graph.graph.state import State
 from sst_graph.hand_eye.graph import PRIOR_SIGMAS, state_values
-from sst_graph.inspect.frame_information import MAX_NUMBER
+from sst_graph.inspect.frame_information import MAX_NUMBER, rounded
 from sst_graph.result import CalibrationResult, FrameId
 from sst_graph.types import ByValue, FloatArray
 
@@ -77,8 +77,8 @@ def to_document(gained: Gained) -> dict[str, Any]:
         "kind": gained.kind,
         "drive": [gain.frame.drive for gain in gains],
         "frame": [gain.frame.frame for gain in gains],
-        "bits": [None if gain.bits is None else _rounded(gain.bits) for gain in gains],
-        "values": [[_rounded(float(value)) for value in gain.values] for gain in gains],
+        "bits": [rounded(gain.bits) for gain in gains],
+        "values": [rounded(gain.values) for gain in gains],
     }
 
 
@@ -109,10 +109,6 @@ def gained_of(result: CalibrationResult) -> Gained | None:
         expected = f"finite numbers of at most {MAX_NUMBER:g}"
         raise DataError(place, "a value that is not finite, or huge", expected)
     return Gained(document["kind"], gains)
-
-
-def _rounded(value: float) -> float:
-    return float(f"{value:.4g}")
 
 
 def _log_det(covariance: FloatArray) -> float:

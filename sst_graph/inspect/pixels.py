@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
-
 import gtsam
 import numpy as np
 
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.assumptions.model import Scene, View
-from sst_graph.files.checked_values import is_number
+from sst_graph.inspect.considered import considered_errors
 from sst_graph.result import CalibrationResult
 from sst_graph.types import FloatArray
 
@@ -41,26 +38,13 @@ def pixel_covariance(result: CalibrationResult, cP: FloatArray, pose_H_unknowns:
     uv_H_pose = result.camera.uv_H_cP(cP[None])[0] @ cP_H_cTl(result.T_camera_lidar, cP)
     J = uv_H_pose @ pose_H_unknowns
     found = J @ result.covariance @ J.T
-    for shift, sigma, sensitivity in _considered_lens(result, cP):
-        step, picture = sigma * (J @ sensitivity), sigma * shift
-        found += np.outer(step + picture, step + picture) - np.outer(step, step)
-    return np.asarray(found)
-
-
-def _considered_lens(
-    result: CalibrationResult, cP: FloatArray
-) -> Iterator[tuple[FloatArray, float, FloatArray]]:
-    """Of each parameter that moves pixels: shift (2,) of this one's by a unit of it [px], its considered
-    deviation, and the sensitivity (7,) of the estimate."""
-    stored = result.diagnostics.get("assumptions")
     view = _view(result, cP)
-    for name, entry in stored.items() if isinstance(stored, Mapping) else ():
-        if name not in ASSUMPTIONS or not isinstance(entry, Mapping):
-            continue
-        shift = ASSUMPTIONS[name].effect(view).pixel_shift
-        sigma, sensitivity = _numbers([entry.get("sigma")], 1), _numbers(entry.get("sensitivity"), 7)
-        if shift is not None and sigma is not None and sensitivity is not None:
-            yield shift[0], float(sigma[0]), sensitivity
+    for name, (sigma, sensitivity) in considered_errors(result).items():
+        shift = ASSUMPTIONS[name].effect(view).pixel_shift if name in ASSUMPTIONS else None
+        if shift is not None:
+            step, picture = sigma * (J @ sensitivity), sigma * shift[0]
+            found += np.outer(step + picture, step + picture) - np.outer(step, step)
+    return np.asarray(found)
 
 
 def _view(result: CalibrationResult, cP: FloatArray) -> View:
@@ -68,9 +52,3 @@ def _view(result: CalibrationResult, cP: FloatArray) -> View:
     camera = result.camera
     lP = result.T_camera_lidar.transformTo(cP)
     return Scene(camera, np.zeros(6), 0.0, 0.1).view(lP[None], np.zeros(1), camera.project(cP[None]))
-
-
-def _numbers(values: Any, count: int) -> FloatArray | None:
-    """So many numbers; None where a file holds anything else."""
-    good = isinstance(values, list) and len(values) == count and all(map(is_number, values))
-    return np.array(values, float) if good else None

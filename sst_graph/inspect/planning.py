@@ -19,8 +19,8 @@ import gtsam
 import numpy as np
 
 from sst_graph.covariance.observability import ObservabilityConfig, worst_ratio
+from sst_graph.inspect.considered import considered_errors
 from sst_graph.inspect.frame_information import (
-    MAX_NUMBER,
     FrameInformation,
     positive_part,
     unit_diagonal,
@@ -28,9 +28,6 @@ from sst_graph.inspect.frame_information import (
 )
 from sst_graph.result import CalibrationResult
 from sst_graph.types import ByValue, FloatArray
-
-ASSUMPTIONS = "assumptions"
-"""Key among a result's diagnostics of what it assumes: by name, deviation and sensitivity."""
 
 AT_REST_MPS = 0.3
 """Below this speed a frame counts as standing [m/s]."""
@@ -203,25 +200,13 @@ def predicted_covariance(
 
 def considered_covariance(result: CalibrationResult) -> FloatArray:
     """(7, 7) part of a result's covariance by its assumptions; zeros where it has none."""
-    stored = result.diagnostics.get(ASSUMPTIONS)
     found, variances = np.zeros((7, 7)), np.diag(result.covariance)
-    for entry in stored.values() if isinstance(stored, Mapping) else ():
-        numbers = _numbers(entry)
-        if numbers is not None:
-            step = numbers[0] * numbers[1:]
-            # A part of the covariance is no larger than the whole, whatever a file says.
-            if (step**2 <= variances * (1.0 + 1e-3)).all():
-                found += np.outer(step, step)
+    for sigma, sensitivity in considered_errors(result).values():
+        step = sigma * sensitivity
+        # A part of the covariance is no larger than the whole, whatever a file says.
+        if (step**2 <= variances * (1.0 + 1e-3)).all():
+            found += np.outer(step, step)
     return found
-
-
-def _numbers(entry: Any) -> FloatArray | None:
-    """(8,) deviation and sensitivities of an assumption in a file; None where they are no such numbers."""
-    try:
-        numbers = np.array([entry["sigma"], *entry["sensitivity"]], dtype=np.float64)
-    except (KeyError, TypeError, ValueError, OverflowError):
-        return None
-    return numbers if numbers.shape == (8,) and (np.abs(numbers) <= MAX_NUMBER).all() else None
 
 
 def motion_twists(cTl: gtsam.Pose3, frames: Sequence[FrameInformation]) -> dict[str, FloatArray]:

@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 
 from sst_graph.assumptions import ASSUMPTIONS
+from sst_graph.files.strict_json import json_able
 from sst_graph.fit import CLOSE_PX, Fit, MatchedFrame
 from sst_graph.inspect.budget_text import budget_lines
+from sst_graph.inspect.considered import stored_assumptions
 from sst_graph.inspect.inspection import Inspection, inspect_result, strong_correlations
 from sst_graph.inspect.inspection_text import MOST_SENTENCES, advice_sentences, correlation_sentence
 from sst_graph.inspect.reasons import as_sentence, capitalized, short_reasons
@@ -294,8 +296,8 @@ def _background(inputs: ReportInputs, inspection: Inspection) -> str:
         correlation_table(result),
         bullets(sentences),
         grid(ellipse_charts(result, strong_correlations(result.covariance, 0.0))),
-        details("Settings", preformatted(json.dumps(_plain(result.config), indent=1))),
-        details("How the drives were read", preformatted(json.dumps(_plain(result.read_as), indent=1)))
+        details("Settings", preformatted(json.dumps(json_able(result.config), indent=1))),
+        details("How the drives were read", preformatted(json.dumps(json_able(result.read_as), indent=1)))
         if result.read_as
         else "",
         details("Versions", table(("package", "version"), versions)) if versions else "",
@@ -304,12 +306,8 @@ def _background(inputs: ReportInputs, inspection: Inspection) -> str:
 
 def _assumptions(result: CalibrationResult) -> str:
     """A row an assumption: what the data say of its parameter, and the verdict."""
-    stored = result.diagnostics.get("assumptions")
-    rows = [
-        _assumption_row(name, entry)
-        for name, entry in (stored.items() if isinstance(stored, Mapping) else ())
-        if name in ASSUMPTIONS and isinstance(entry, Mapping)
-    ]
+    stored = stored_assumptions(result).items()
+    rows = [_assumption_row(name, entry) for name, entry in stored if name in ASSUMPTIONS]
     if not rows:
         return ""
     head = ("assumption", "by the data", "considered", "verdict", "what it would mean if it did not hold")
@@ -325,12 +323,3 @@ def _assumption_row(name: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
     held = "holds" if tested else "its effect is in the sigmas"
     said = f"contradicted: {ASSUMPTIONS[name].remedy}" if entry.get("contradicted") else held
     return name, found, part, said, ASSUMPTIONS[name].violation
-
-
-def _plain(value: Any) -> Any:
-    """What JSON can hold."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
-    return value if value is None or isinstance(value, str | int | float | bool) else str(value)

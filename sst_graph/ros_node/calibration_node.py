@@ -18,7 +18,7 @@ from sst_graph.data.ros.images import picture_of
 from sst_graph.data.ros.topics import CLOUD, COMPRESSED, IMAGE, INFO
 from sst_graph.data.ros.transforms import Transforms
 from sst_graph.data.source import TURNS
-from sst_graph.errors import ConfigError, DataError, count_of
+from sst_graph.errors import DataError, count_of
 from sst_graph.reference import load_initial
 from sst_graph.ros_node.published import OK, WARN, Diagnosis, NodeMessages, Published, diagnosis_of
 from sst_graph.ros_node.sensor import SensorRecord
@@ -58,9 +58,6 @@ class CalibrationNode:
             ConfigError, DataError: a parameter that cannot be used.
         """
         self.settings, self._config = settings, config or TrackerConfig()
-        if settings.label_encoding not in set(MaskEncoding):
-            names = ", ".join(MaskEncoding)
-            raise ConfigError(f"label_encoding: found {settings.label_encoding!r}, expected one of {names}")
         self._encoding = MaskEncoding(settings.label_encoding)
         self._reading = _reading(settings)
         given = settings.init not in (INIT_TF, INIT_NONE)

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from sst_graph.classes import MaskEncoding
 from sst_graph.config import Settings, setting, with_overrides
 from sst_graph.data.source import TURNS
 from sst_graph.errors import ConfigError
@@ -25,21 +26,28 @@ class NodeSettings(Settings):
     mask_topic: str = setting(
         "", doc="Masks with the stamps of their images; the field label of the clouds is then read, too."
     )
-    label_encoding: str = setting("ids", doc="Numbers of the masks; as --label-encoding, but for auto.")
+    label_encoding: str = setting(
+        "ids", choices=tuple(MaskEncoding), doc="Numbers of the masks; as --label-encoding, but for auto."
+    )
     init: str = setting(
         INIT_TF,
         doc="Start: tf (the transforms on /tf_static), none, or a KITTI calib.txt or calibration.json.",
     )
     sweep: str = setting(
         "auto",
+        choices=("auto", "compensated", *TURNS),
         doc="Times of the points: auto (those in the clouds), compensated, clockwise, counterclockwise.",
     )
     sweep_period_s: float = setting(0.1, at_least=0.001, at_most=60.0, doc="Duration of a turn.")
     publish: str = setting(
-        "adopted", doc="On /tf: the adopted calibration, the latest estimate (latest), or nothing (none)."
+        "adopted",
+        choices=("adopted", "latest", "none"),
+        doc="On /tf: the adopted calibration, the latest estimate (latest), or nothing (none).",
     )
     parent: str = setting(
-        "camera", doc="Parent on /tf: camera or lidar. The child must have no other parent."
+        "camera",
+        choices=("camera", "lidar"),
+        doc="Parent on /tf: camera or lidar. The child must have no other parent.",
     )
     hold_s: float = setting(
         0.2, at_least=0.0, at_most=10.0, doc="Messages wait so long to be put in the order of their stamps."
@@ -50,9 +58,6 @@ class NodeSettings(Settings):
     silent_s: float = setting(1.0, at_least=0.01, at_most=3600.0, doc="A sensor without a message is silent.")
 
     def __post_init__(self) -> None:
-        _one_of("sweep", self.sweep, ("auto", "compensated", *TURNS))
-        _one_of("publish", self.publish, ("adopted", "latest", "none"))
-        _one_of("parent", self.parent, ("camera", "lidar"))
         for name in ("image_topic", "info_topic", "cloud_topic", "init"):
             if not getattr(self, name):
                 raise ConfigError(f"{name}: found an empty name, expected one")
@@ -80,8 +85,3 @@ def node_settings(parameters: Mapping[str, Any]) -> tuple[NodeSettings, TrackerC
         )
     config = with_overrides(TrackerConfig(), [one for one in listed if one])
     return NodeSettings(**values), config
-
-
-def _one_of(name: str, value: Any, names: tuple[str, ...]) -> None:
-    if value not in names:
-        raise ConfigError(f"{name}: found {value!r}, expected one of {', '.join(names)}")

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar, cast, overload
+from typing import TypeVar
 
 import numpy as np
 
-from sst_graph.data.frame_parts import image_at, scan_at
-from sst_graph.data.source_view import SourceView
+from sst_graph.data.source_view import ChangedSource
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.factors.arguments import checked_callback
 from sst_graph.segmentation.segmenter import ImageLabels, ImageSegmenter, PointLabels, ScanSegmenter
 from sst_graph.segmentation.store import LabelStore, StoredModel, cache_folder
-from sst_graph.types import CameraImage, Frame, Scan, SemanticClass, Source
+from sst_graph.types import CameraImage, Scan, SemanticClass, Source
 
 _LOG = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -145,48 +144,21 @@ class Labelling:
         )
 
 
-class LabelledSource(SourceView):
+class LabelledSource(ChangedSource):
     """A source whose images and scans are labelled as they are read (satisfies
     :class:`sst_graph.types.Source`).
-
-    What else the source has to say (of its sweep, its topics) is passed on.
     """
 
     def __init__(self, source: Source, labelling: Labelling) -> None:
         self.source, self.labelling = source, labelling
 
-    @overload
-    def __getitem__(self, position: int) -> Frame: ...
-    @overload
-    def __getitem__(self, position: slice) -> LabelledSource: ...
-    def __getitem__(self, position: int | slice) -> Frame | LabelledSource:
-        """Frame at a position, or the drive restricted to a slice; errors as the source's own."""
-        if isinstance(position, slice):
-            return LabelledSource(cast("Source", self.source[position]), self.labelling)  # type: ignore[index]
-        return self._labelled(self.source[position])
+    def changed_scan(self, scan: Scan) -> Scan:
+        """The scan with its labels."""
+        return self.labelling.scan(scan)
 
-    def __iter__(self) -> Iterator[Frame]:
-        return map(self._labelled, self.source)
-
-    def read_scan(self, position: int) -> Scan | None:
-        """Labelled scan of the frame at a position."""
-        scan = scan_at(self.source, position)
-        return None if scan is None else self.labelling.scan(scan)
-
-    def read_image(self, position: int) -> CameraImage | None:
-        """Labelled image of the frame at a position."""
-        image = image_at(self.source, position)
-        return None if image is None else self.labelling.image(image)
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__") or name in ("source", "labelling"):
-            raise AttributeError(name)
-        return getattr(self.source, name)
-
-    def _labelled(self, frame: Frame) -> Frame:
-        scan = None if frame.scan is None else self.labelling.scan(frame.scan)
-        image = None if frame.image is None else self.labelling.image(frame.image)
-        return replace(frame, scan=scan, image=image)
+    def changed_image(self, image: CameraImage) -> CameraImage:
+        """The image with its mask."""
+        return self.labelling.image(image)
 
 
 def with_labels(

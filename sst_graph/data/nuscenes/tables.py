@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 
 from sst_graph.errors import DataError
-from sst_graph.files.checked_values import checked_pose
+from sst_graph.files.checked_values import pose_by_quaternion
 from sst_graph.files.reading import parse_json
 
 Record = Mapping[str, Any]
@@ -134,12 +134,5 @@ def pose_of(record: Record, path: Path) -> gtsam.Pose3:
         DataError: no such pose.
     """
     place = f"{path} ({record.get('token')!r:.40})"
-    t = matrix_of(record.get("translation"), (3,), place)
-    q = matrix_of(record.get("rotation"), (4,), place)
-    length = float(np.linalg.norm(q))
-    if not abs(length - 1.0) < 1e-3:
-        raise DataError(place, f"a quaternion of length {length:.6g}", "1")
-    matrix = np.eye(4)
-    matrix[:3, :3] = gtsam.Rot3.Quaternion(*(q / length)).matrix()
-    matrix[:3, 3] = t
-    return checked_pose(matrix, place)
+    translation = matrix_of(record.get("translation"), (3,), place)
+    return pose_by_quaternion(translation, matrix_of(record.get("rotation"), (4,), place), place)

@@ -5,16 +5,17 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from sst_graph.errors import count_of
+from sst_graph.experiments.markdown import NONE, median, table
 from sst_graph.experiments.paper.config import START, VARIANTS, PaperTableConfig
 from sst_graph.experiments.paper.runs import Run
 
-NONE = "–"
 OURS = "Numbering and layout are ours: they follow the questions of the paper, not its pages."
 
 
@@ -59,22 +60,16 @@ def markdown(runs: Sequence[Run], layout: Layout, config: PaperTableConfig) -> s
     if layout.with_time:
         columns[1:1] = ["images late: true / nominal [ms]"]
         columns += ["time offset, median [ms]", "true error [ms]", "nominal error [ms]"]
-    header = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
-    names = list(dict.fromkeys(run.drive for run in runs)) if config.data else [""]
-    for name in names:
+    for name in dict.fromkeys(run.drive if config.data else "" for run in runs):
         lines += [name, ""] if name else []
-        lines += header
-        for late in config.images_late:
-            for method in (START, *config.methods):
-                own = [
-                    run
-                    for run in runs
-                    if run.method == method and run.images_late == late and name in ("", run.drive)
-                ]
-                lines.append(_row(own, layout, config))
-        lines += [_printed_row(row, layout) for row in layout.printed]
-        lines.append("")
-    return "\n".join(lines).rstrip("\n") + "\n"
+        here = [run for run in runs if name in ("", run.drive)]
+        rows = []
+        for late, method in itertools.product(config.images_late, (START, *config.methods)):
+            own = [run for run in here if (run.images_late, run.method) == (late, method)]
+            rows.append(_row(own, layout, config))
+        rows += [_printed_row(row, layout) for row in layout.printed]
+        lines.append(table("| " + " | ".join(columns) + " |", rows))
+    return "\n".join(lines)
 
 
 def csv_text(runs: Sequence[Run], config: PaperTableConfig) -> str:
@@ -113,7 +108,7 @@ def _conditions(layout: Layout, config: PaperTableConfig) -> str:
     )
 
 
-def _row(own: Sequence[Run], layout: Layout, config: PaperTableConfig) -> str:
+def _row(own: Sequence[Run], layout: Layout, config: PaperTableConfig) -> list[str]:
     """The runs of one method at one delay."""
     method, late = own[0].method, own[0].images_late
     bad = [run for run in own if run.failed(config)]
@@ -124,7 +119,7 @@ def _row(own: Sequence[Run], layout: Layout, config: PaperTableConfig) -> str:
         method,
         f"{len(bad)} of {len(own)}" + (f" ({empty} without an estimate)" if empty else ""),
         f"{flagged} of {len(bad)}" if bad and method != START else NONE,
-        f"{np.median([run.qad_deg for run in own]):.2f}",
+        median([run.qad_deg for run in own], 2),
         _mean_median([run.qad_deg for run in good], 2),
         _mean_median([run.aead_deg for run in good], 2),
         _mean_median([100.0 * run.atd_m for run in good], 1),
@@ -135,13 +130,13 @@ def _row(own: Sequence[Run], layout: Layout, config: PaperTableConfig) -> str:
         cells[1:1] = [f"{late}: {NONE if np.isnan(true) else f'{true:.1f}'} / {nominal:.0f}"]
         timed = method != START and VARIANTS[method].has_time_offset
         offsets = [1e3 * run.time_offset_s for run in good if timed and run.time_offset_s is not None]
-        cells.append(f"{np.median(offsets):.1f}" if offsets else NONE)
+        cells.append(median(offsets, 1))
         cells.append(_mean_median(_absolute([run.true_error_ms for run in good]), 1))
         cells.append(_mean_median(_absolute([run.nominal_error_ms(config) for run in good]), 1))
-    return "| " + " | ".join(cells) + " |"
+    return cells
 
 
-def _printed_row(row: Printed, layout: Layout) -> str:
+def _printed_row(row: Printed, layout: Layout) -> list[str]:
     """A row of the paper."""
     cells = [
         f"*printed:* {row.name}",
@@ -155,7 +150,7 @@ def _printed_row(row: Printed, layout: Layout) -> str:
     if layout.with_time:
         cells[1:1] = ["1"]
         cells += [NONE, NONE if row.time_error_ms is None else f"{row.time_error_ms:g}", NONE]
-    return "| " + " | ".join(cells) + " |"
+    return cells
 
 
 def _absolute(values: Sequence[float | None]) -> list[float]:

@@ -15,16 +15,15 @@ import numpy as np
 from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drives
 from sst_graph.batch.config import Method
 from sst_graph.config import Settings, setting
-from sst_graph.data import open_source
 from sst_graph.drive.preparation import Drive, prepare_drive
 from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.experiments.peers.frames import PeerProblem, peer_frames
 from sst_graph.experiments.peers.methods import NAMES, PEERS
-from sst_graph.experiments.starts import start_near, truth_of
+from sst_graph.experiments.starts import drive_of, start_near, truth_of
 from sst_graph.metrics import calibration_errors
 from sst_graph.odometry.sweep import with_sweep
 from sst_graph.result import CalibrationResult
-from sst_graph.simulator import SimulationConfig, simulate
+from sst_graph.simulator import SimulationConfig
 from sst_graph.types import GroundTruth, Source
 
 
@@ -211,10 +210,7 @@ class _ReadDrive:
 
 def _read(task: PeerTask) -> _ReadDrive:
     config = task.config
-    if task.place:
-        source = open_source(task.place, image_shift=config.image_shift)
-    else:
-        source = simulate(dataclasses.replace(config.street, seed=config.seed + task.number))
+    source = drive_of(task.place, task.number, config)
     truth = truth_of(source)
     swept = with_sweep(source, config.calibration.decide_sweep)
     drive = prepare_drive(swept, config.calibration.classes, config.calibration.prepare)

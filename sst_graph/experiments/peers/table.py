@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from sst_graph.drive.preparation import Progress
+from sst_graph.experiments.markdown import NONE, median, table
 from sst_graph.experiments.peers.methods import OWN, PEERS
 from sst_graph.experiments.peers.runs import START, PeerRun, PeersConfig, runs_of, tasks_of
 from sst_graph.experiments.resumable import Work, rows_of
@@ -57,23 +58,23 @@ def markdown(runs: Sequence[PeerRun], config: PeersConfig) -> str:
         "processor time, median.",
     ]
     for title, own in _groups(runs):
-        parts += ["", f"**{title}**", "", *_table(own, config)]
+        parts += ["", f"**{title}**", "", _table(own, config).rstrip("\n")]
     return "\n".join(parts) + "\n"
 
 
-def _table(runs: Sequence[PeerRun], config: PeersConfig) -> list[str]:
+def _table(runs: Sequence[PeerRun], config: PeersConfig) -> str:
     head = ["method", *(f"±{r:g}°" for r in config.ranges_deg), "silent", "σ of rotation", "seconds", "MB"]
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    rows = []
     for method in dict.fromkeys(row.method for row in runs):
         own = [row for row in runs if row.method == method]
         label = method if method in (START, *OWN) else f"{method} *r*"
         reasons = {row.why_not for row in own}
         if "" not in reasons:
-            lines.append("| " + " | ".join([label, min(reasons), *["–"] * (len(head) - 2)]) + " |")
+            rows.append([label, min(reasons), *[NONE] * (len(head) - 2)])
             continue
         cells = [_cell([row for row in own if row.range_deg == r], config) for r in config.ranges_deg]
-        lines.append("| " + " | ".join([label, *cells, *_remaining_cells(method, own, config)]) + " |")
-    return lines
+        rows.append([label, *cells, *_remaining_cells(method, own, config)])
+    return table("| " + " | ".join(head) + " |", rows)
 
 
 def _cell(runs: Sequence[PeerRun], config: PeersConfig) -> str:
@@ -97,8 +98,7 @@ def _remaining_cells(method: str, runs: Sequence[PeerRun], config: PeersConfig) 
 
 
 def _median(values: Sequence[float | None], digits: int, unit: str = "") -> str:
-    known = [value for value in values if value is not None]
-    return f"{np.median(known):.{digits}f}{unit}" if known else "–"
+    return median([value for value in values if value is not None], digits, unit)
 
 
 def figure(runs: Sequence[PeerRun], config: PeersConfig, figure_of: Callable[..., Any]) -> bytes:

@@ -1,0 +1,36 @@
+"""What a result's covariance holds of its assumptions, as stored under ``diagnostics.assumptions``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from sst_graph.files.checked_values import is_number
+from sst_graph.result import CalibrationResult
+from sst_graph.types import FloatArray
+
+ASSUMPTIONS_KEY = "assumptions"
+"""Key in the diagnostics of a result."""
+
+
+def stored_assumptions(result: CalibrationResult) -> dict[str, Mapping[str, Any]]:
+    """The entry of each assumption, by name; empty where the result has none."""
+    stored = result.diagnostics.get(ASSUMPTIONS_KEY)
+    entries = stored.items() if isinstance(stored, Mapping) else ()
+    return {str(name): entry for name, entry in entries if isinstance(entry, Mapping)}
+
+
+def considered_errors(result: CalibrationResult) -> dict[str, tuple[float, FloatArray]]:
+    """Deviation of each assumption that was considered, and the estimate's sensitivity (7,) to it, by name.
+
+    What a file holds in the place of these numbers is passed over.
+    """
+    found = {}
+    for name, entry in stored_assumptions(result).items():
+        sigma, sensitivity = entry.get("sigma"), entry.get("sensitivity")
+        numbers = [sigma, *sensitivity] if isinstance(sensitivity, list) else []
+        if len(numbers) == 8 and all(map(is_number, numbers)):
+            found[name] = float(numbers[0]), np.array(numbers[1:], np.float64)
+    return found
