@@ -241,18 +241,21 @@ def _sure_tracker(street: SimulatedDrive) -> Tracker:
 def test_no_estimate_is_ok_while_the_latest_frames_contradict_it(
     street: SimulatedDrive, frames: list[Frame]
 ) -> None:
-    """From the second such frame on, not only from the alarm or from a suspected change."""
-    tracker, before, past = _warmed_up(_sure_tracker(street)), list[int](), 0
+    """From the second such frame on, and where the newest alone does, not only from the alarm or from a
+    suspected change."""
+    tracker, before, past, alone = _warmed_up(_sure_tracker(street)), list[int](), 0, list[int]()
     for frame in frames[: STEP + 8]:
         assert frame.image is not None
         image = knocked(frame.image, street, 0.5) if frame.index >= STEP else frame.image
         update = tracker.add(dataclasses.replace(frame, image=image))
         past = past + 1 if (update.chi2 or 0.0) > tracker.setup.config.alarm.chi2 else 0
-        if past > 1 and not update.alarm:
+        newest = tracker.monitor.changes.statistic.newest > tracker.setup.config.alarm.chi2
+        alone += [frame.index] if newest and past < 2 else []
+        if (past > 1 or newest) and not update.alarm:
             assert update.status == "unconfirmed" and not update.adopted
             before.append(frame.index)
             assert "contradict the estimate" in tracker.result().reasons[0]
-    assert before and before[0] >= STEP
+    assert before and before[0] >= STEP and alone
 
 
 def test_a_knock_that_no_frame_can_show_is_not_ok(

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 from contextlib import nullcontext
 from pathlib import Path
 
 import gtsam
 import numpy as np
 import pytest
+from stored import simulated
+from streets import TRACKED_STREET
 
 from sst_graph import Tracker
 from sst_graph.data import open_source
@@ -59,3 +62,15 @@ def test_a_real_drive_three_images_off_starts_in_the_right_basin() -> None:
     )  # 99.9 % of chi-squared, 3
     tracker.optimize()
     assert np.degrees(np.linalg.norm(turn())) < 0.15
+
+
+def test_scans_at_half_the_rate_get_twice_the_work_for_a_start() -> None:
+    street = simulated(TRACKED_STREET)
+    for period_ns, factor in ((50_000_000, 1), (104_000_000, 1), (200_000_000, 2), (900_000_000, 2)):
+        tracker = Tracker(street.camera)
+        each = tracker.initializer.work_per_frame
+        for k in range(2):
+            scan = street[k].scan
+            assert scan is not None
+            tracker.add_scan(dataclasses.replace(scan, stamp_ns=k * period_ns))
+        assert each is not None and tracker.initializer.work_for(tracker.inputs.window) == factor * each

@@ -334,8 +334,8 @@ class ChangeDetector:
 
     @property
     def contradicted(self) -> bool:
-        """Whether two frames or more in a row are past the threshold, or a change is suspected."""
-        return self.statistic.exceeded > 1 or bool(self.suspected_change)
+        """Whether the newest frame alone or two in a row are past the threshold, or a change is suspected."""
+        return self.statistic.contradicted or bool(self.suspected_change)
 
     @property
     def lost(self) -> bool:

@@ -174,6 +174,8 @@ class ChangeStatistic:
         recent: scores of the latest frames.
         usual: T of earlier quiet frames.
         exceeded: frames in a row past the threshold.
+        newest: the statistic of the newest frame alone: the first one after a step hardly shows it together
+            with those before it.
         latest: the latest comparison; None before one.
     """
 
@@ -181,21 +183,23 @@ class ChangeStatistic:
         self.threshold, self.object_sigma_px = threshold, object_sigma_px
         self.recent: deque[LinearizedPair] = deque(maxlen=FRAMES)
         self.usual: deque[float] = deque(maxlen=_USUAL_FRAMES)
-        self.exceeded = 0
+        self.exceeded, self.newest = 0, 0.0
         self.latest: Comparison | None = None
 
     def restart(self) -> None:
         """Forget the frames, not their usual size: a new calibration begins."""
         self.recent.clear()
         self.latest = None
-        self.exceeded = 0
+        self.exceeded, self.newest = 0, 0.0
 
     def add(self, scores: Sequence[LinearizedPair], estimate: ComparedEstimate) -> float | None:
         """The statistic with new frames' scores; None while there are too few."""
         self.recent.extend(scores)
         if not scores or len(self.recent) < FRAMES:
             return None
-        self.latest = self.compare(self.recent, estimate)
+        compared, count = ComparedScores.of(self.recent, estimate, self.object_sigma_px), len(self.recent)
+        self.latest = compared.part(0, count)
+        self.newest = self.normalized(compared.part(max(0, count - len(scores)), count))
         T = self.latest.chi2()
         value = T / self._scale(self.latest)
         if value > self.threshold:
@@ -233,6 +237,11 @@ class ChangeStatistic:
         """
         shown = comparison.chi2_of(steps) / comparison.variance_ratio
         return np.asarray(shown > self.threshold * self._usual_scale(comparison))
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether the newest frame alone, or the latest ones twice in a row, are past the threshold."""
+        return self.exceeded > 1 or self.newest > self.threshold
 
     @property
     def confirmed(self) -> bool:

@@ -25,6 +25,8 @@ from sst_graph.tracker.window.window import Stretch, Window
 _WORK_PER_FRAME = 36
 """Work on a start with each frame, in units of 4 ms: the estimate comes when all is done, some frames
 later, and no frame takes long for it. Work is counted, not timed, so that equal frames give equal results."""
+_PERIOD_S, _MOST_PERIODS = 0.1, 2
+"""Time between two scans for which that is meant, and twice of which twice as much is done [s]."""
 _RESTART_SCANS = 8
 """Scans that the start after an alarm is made of: fewer than a first one, for it begins near an estimate."""
 _MAX_ATTEMPTS = 2
@@ -204,13 +206,21 @@ class Initializer:
         """
         if not self.under_way and self._due(matcher.window):
             self.search = self._search(matcher.window)
+        work = self.work_for(matcher.window)
         if self.search is not None:
-            first = self.search.advance(self.work_per_frame)
+            first = self.search.advance(work)
             if first is not None:
                 self._begin_graph(matcher.window, first, self.search.numbers)
-            if self.work_per_frame is not None:
+            if work is not None:
                 return None
-        return None if self.graph is None else self._made(matcher, self.work_per_frame)
+        return None if self.graph is None else self._made(matcher, work)
+
+    def work_for(self, window: Window) -> int | None:
+        """Work to be done with the newest scan: where scans are rarer, there is more time for each."""
+        if self.work_per_frame is None:
+            return None
+        seconds, _ = window.latest_step()
+        return self.work_per_frame * min(max(round(seconds / _PERIOD_S), 1), _MOST_PERIODS)
 
     def finish(self, matcher: WindowMatcher) -> Initialization | None:
         """Complete the initialization at the end of a drive; None where there are too few scans.
