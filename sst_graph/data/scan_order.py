@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.data.scan_columns import rings_from_columns
+
 MAX_RINGS = 256
 MIN_POINTS_PER_RING = 8
 """Mean number of points in a ring below which rings are not accepted."""
@@ -27,7 +29,8 @@ def rings_from_order(points: NDArray[np.float32]) -> NDArray[np.uint16] | None:
     summed modulo a full turn (so a gap of a cropped cloud is a step ahead, a start over likewise),
     and a ring ends wherever the sum passes the seam. The seam lies ahead (KITTI), behind or
     abeam; the one whose rings explain the elevation best is taken. None where rings do not explain
-    it: a cloud in another order, or one that was shuffled or thinned too far.
+    it, nor those of columns (:mod:`sst_graph.data.scan_columns`): a cloud in another order, or one that was
+    shuffled or thinned too far.
 
     Rings are counted from the first that has points: lasers without any return are not counted.
     """
@@ -51,7 +54,9 @@ def rings_from_order(points: NDArray[np.float32]) -> NDArray[np.uint16] | None:
         explained = _explained(elevation, counts)
         if explained > best_explained:
             best, best_explained = counts, explained
-    return None if best is None else np.repeat(np.arange(len(best), dtype=np.uint16), best)
+    if best is None:
+        return rings_from_columns(points)
+    return np.repeat(np.arange(len(best), dtype=np.uint16), best)
 
 
 def _modulo_turn(angle: Any) -> Any:

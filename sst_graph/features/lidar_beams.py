@@ -27,6 +27,8 @@ _STEPS = 8_000
 """Steps between neighbours of which the median is taken, about."""
 _APART = 10.0
 """Distance of two rings among the keys that points are sorted by; azimuths differ by less [rad]."""
+_FAR_STRIP, _FAR_SHARE = np.radians(1.0), 0.1
+"""Strips of elevations [rad] in which less than this share of the points is far show their rings by all."""
 _MIN_RHO_RATIO = 1.5
 """A cone's height is fitted only where the ring's far points are this much farther than its near ones."""
 
@@ -86,15 +88,18 @@ def arrange_beams(points: FloatArray, rings: NDArray[np.integer] | None) -> Beam
 def recover_rings(elevation: FloatArray, rho: FloatArray) -> IntArray:
     """(n,) ring numbers from elevation angles [rad]: peaks of their histogram over far points.
 
-    Lasers off the origin smear the angle of near points, so the peaks come from points beyond 8 m
-    (from all points where too few are that far). A sensor without rings gets strips of 0.4 degrees.
+    Lasers off the origin smear the angle of near points, so the peaks come from points beyond 8 m. Rings that
+    look down meet the ground before: at elevations with hardly a far point, and where too few are that far at
+    all, the peaks come from all points. A sensor without rings gets strips of 0.4 degrees.
     """
     if len(elevation) == 0:
         return np.zeros(0, dtype=np.intp)
     resolution = np.radians(0.04)
     far = rho > 8.0
-    sample = elevation[far] if np.count_nonzero(far) > 1000 else elevation
     low = float(elevation.min())
+    strip = ((elevation - low) / _FAR_STRIP).astype(np.intp)
+    share = np.bincount(strip, far) / np.maximum(np.bincount(strip), 1)
+    sample = elevation[far | (share < _FAR_SHARE)[strip]] if np.count_nonzero(far) > 1000 else elevation
     bins = int((float(elevation.max()) - low) / resolution) + 2
     histogram = np.bincount(((sample - low) / resolution).astype(np.intp), minlength=bins).astype(float)
     smooth = np.convolve(histogram, [0.25, 0.5, 0.25], mode="same")

@@ -24,7 +24,15 @@ from sst_graph.factors.robust import RobustKernel
 from sst_graph.fit import OuterIteration
 from sst_graph.graph.building import joint_graph
 from sst_graph.graph.frozen_problem import FrozenPoint, FrozenProblem
-from sst_graph.graph.matching import DriveMatches, GraphConfig, PairMatches, Tracks, edges_of, match_all
+from sst_graph.graph.matching import (
+    DriveEdges,
+    DriveMatches,
+    GraphConfig,
+    PairMatches,
+    Tracks,
+    edges_of,
+    match_all,
+)
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.stepwise import Stepwise, run_to_end
@@ -65,6 +73,9 @@ MAX_OUTER = 40
 """Most outer iterations: a bound on the time; what has not converged by then is reported."""
 MIN_MATCHES = 30
 """Fewest matches of a solution: single frames with few objects have more, and seven unknowns need them."""
+_MOSTLY, _UNKNOWN_MPS = 0.5, 1.0
+"""Too few matches are said to be due to moving vehicles where more than this share of the outlines moves, at
+velocities that are off by more than this [m/s]."""
 _PAIRS_A_UNIT = 6
 """Pairs of scan and image whose outer iteration costs one unit of work (:mod:`sst_graph.stepwise`)."""
 MIN_CONCENTRATION = 0.6
@@ -202,7 +213,7 @@ def solve_joint_steps(
         scale = kernels_px[min(outer, len(kernels_px) - 1)]
         matches = match_all(edges, state, RobustKernel("geman_mcclure", scale))
         pairs = sum(len(own.paired) for own in matches)
-        _check_matches(sum(map(len, matches)), pairs, config)
+        _check_matches(sum(map(len, matches)), pairs, config, edges)
         # 2. Inner optimisation with the matches frozen.
         frozen = FrozenProblem(matches, state, config.graph, centre, problem.prior)
         optimum, system = frozen.optimum(INNER_ITERATIONS)
@@ -331,14 +342,30 @@ def _seen(solution: JointSolution) -> int:
     return max(1, sum(int(own.found.seen[own.counts > 0].sum()) for own in solution.matches))
 
 
-def _check_matches(matches: int, pairs: int, config: JointConfig) -> None:
+def _check_matches(matches: int, pairs: int, config: JointConfig, edges: Sequence[DriveEdges]) -> None:
     if matches >= config.min_matches:
         return
     expected = f"expected {config.min_matches} or more"
-    if not matches:
-        raise EstimationError(
-            f"no silhouette matches, {expected}: no boundary point of a scan is near a contour of its "
-            "class, or an edge of the picture, in the image of its time"
+    moving = _moving_share(edges)
+    if moving > _MOSTLY:
+        cause = (
+            f"; {100.0 * moving:.0f} % of the outlines are those of vehicles that move, at velocities which "
+            "the scans do not tell: record parked or slow vehicles, too"
         )
+    elif not matches:
+        cause = (
+            ": no boundary point of a scan is near a contour of its class, or an edge of the picture, in the "
+            "image of its time"
+        )
+    else:
+        cause = ""
     found = count_of(matches, "silhouette match", "silhouette matches")
-    raise EstimationError(f"{found} in {count_of(pairs, 'pair')} of scan and image, {expected}")
+    where = f"{found} in {count_of(pairs, 'pair')} of scan and image" if matches else "no silhouette matches"
+    raise EstimationError(f"{where}, {expected}{cause}")
+
+
+def _moving_share(edges: Sequence[DriveEdges]) -> float:
+    """Share of the boundary points on objects that move at velocities which are not known."""
+    unknown = [own.unknown_mps for own in edges if own.unknown_mps is not None]
+    moving = sum(int(np.count_nonzero(speeds_mps > _UNKNOWN_MPS)) for speeds_mps in unknown)
+    return moving / max(sum(map(len, edges)), 1)

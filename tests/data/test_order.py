@@ -60,6 +60,34 @@ def test_other_orders_give_none() -> None:
     assert rings_from_order(noise) is None
 
 
+def fired(*, speed_mps: float, upwards: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """A street of blocks of many distances, measured firing after firing on the way and moved to where the
+    LiDAR is when it faces forward; a fifth of the returns is missing. Points and the true beam of each."""
+    rng = np.random.default_rng(5)
+    elevations = np.radians(np.linspace(2.0, -24.0, BEAMS))
+    reaches = rng.uniform(5.0, 40.0, 80)
+    points, beams = [], []
+    for azimuth in np.radians(np.arange(-180.0, 180.0, 0.4)):
+        forward = speed_mps * azimuth / (2.0 * np.pi) * 0.1
+        to_ground = 1.8 / np.maximum(np.tan(-elevations), 1e-3)
+        reach = np.minimum(to_ground, reaches[int((azimuth + np.pi) / (2.0 * np.pi) * 80)])
+        directions = [np.full(BEAMS, np.cos(azimuth)), np.full(BEAMS, np.sin(azimuth)), np.tan(elevations)]
+        own = reach[:, None] * np.stack(directions, 1) + [forward, 0.0, 0.0]
+        seen = np.flatnonzero(rng.random(BEAMS) < rng.choice([0.8, 1.0]))[:: -1 if upwards else 1]
+        points.append(own[seen])
+        beams.append(seen)
+    return np.concatenate(points).astype(np.float32), np.concatenate(beams)
+
+
+@pytest.mark.parametrize(("speed_mps", "upwards"), [(0.0, False), (8.0, True), (20.0, False)])
+def test_beams_of_a_cloud_stored_firing_after_firing_are_found(speed_mps: float, upwards: bool) -> None:
+    """At 20 m/s the lower rings move by three times their distance during the turn."""
+    points, beams = fired(speed_mps=speed_mps, upwards=upwards)
+    rings = rings_from_order(points)
+    assert rings is not None and rings.dtype == np.uint16
+    assert np.mean(rings != (BEAMS - 1 - beams if upwards else beams)) < 0.01
+
+
 @pytest.mark.parametrize("count", [0, 1, 2, 9])
 def test_tiny_clouds_give_none(count: int) -> None:
     assert rings_from_order(spin()[0][:count]) is None

@@ -71,6 +71,18 @@ def test_rings_without_numbers() -> None:
     assert mode == sorted(set(mode))
 
 
+def test_rings_that_meet_the_ground_before_any_far_point() -> None:
+    """From 1.8 m all below -13 deg do; the others see walls of all distances."""
+    rank = np.tile(np.arange(24), 500)
+    rng = np.random.default_rng(3)
+    elevation = np.radians(np.linspace(-25.0, 2.0, 24)[rank] + rng.normal(0.0, 0.02, len(rank)))
+    walls = rng.uniform(10.0, 50.0, len(rank))
+    rho = np.where(elevation < np.radians(-2.0), 1.8 / np.tan(np.maximum(-elevation, 0.01)), walls)
+    found = recover_rings(elevation, rho)
+    assert sum(np.bincount(found[rank == k]).max() for k in range(24)) > 0.99 * len(rank)
+    assert sum(np.bincount(rank[found == k]).max() for k in np.unique(found)) > 0.99 * len(rank)
+
+
 def test_a_sensor_without_rings_gets_strips() -> None:
     elevation = np.random.default_rng(0).uniform(-0.2, 0.2, 20_000)
     found = recover_rings(elevation, np.full(len(elevation), 20.0))

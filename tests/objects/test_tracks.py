@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 
 from sst_graph.drive.preparation import Drive, ScanFeatures
+from sst_graph.errors import EstimationError
 from sst_graph.factors import PinholeCamera
 from sst_graph.features.lidar_edges import Boundaries
+from sst_graph.graph.outer_loop import KERNELS_PX, JointConfig, JointProblem, solve_joint
+from sst_graph.graph.state import State
 from sst_graph.objects.dynamic_objects import dynamic_object_weights, find_dynamic_objects
 from sst_graph.objects.tracks import ObjectTracker, object_tracks, scan_poses
 from sst_graph.objects.velocity import ObjectVelocities
@@ -75,6 +78,10 @@ def slow(seconds: float) -> np.ndarray:
 
 def moving(seconds: float) -> np.ndarray:
     return np.array([20.0, 0.0, 0.0]) + seconds * np.array([6.0, -2.0, 0.0])
+
+
+def oncoming(seconds: float) -> np.ndarray:
+    return np.array([60.0 - 30.0 * seconds, 5.0, 0.0])
 
 
 def test_one_track_for_each_object() -> None:
@@ -146,6 +153,17 @@ def test_a_fast_vehicle_keeps_its_track() -> None:
         seen.append((found[VEHICLE, 0], found[VEHICLE, 1]))
         place += max(2.6 - 0.3 * k, 0.0)
     assert seen == [(0, 1)] * SCANS
+
+
+def test_too_few_matches_for_vehicles_that_all_move_say_so() -> None:
+    """An oncoming one passes by faster than a track can follow."""
+    for path, cause in (
+        (oncoming, "100 % of the outlines are those of vehicles that move"),
+        (parked, "near a"),
+    ):
+        problem = JointProblem.of([drive(path)], JointConfig())
+        with pytest.raises(EstimationError, match=cause):
+            solve_joint(problem, State(STEP, (0.0,)), KERNELS_PX)
 
 
 def test_the_weight_of_a_dynamic_object_falls_with_its_speed() -> None:
