@@ -95,7 +95,7 @@ def street(seed: int) -> tuple[str, KeptDrive]:
         if name == "second"
         else ThirdStreet(ThirdConfig(**options, density=0.3))  # type: ignore[arg-type]
     )
-    drive = KeptDrive.of(made, sweep="compensated")
+    drive = KeptDrive.of(made, sweep="known")
     assert drive.truth is not None
     ways = np.random.default_rng([seed, 99]).standard_normal((2, 3))
     turn, shift = ways / np.linalg.norm(ways, axis=1)[:, None]

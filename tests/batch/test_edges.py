@@ -38,7 +38,7 @@ def no_classes(scan: Scan) -> Scan:
 
 @cache
 def labelled() -> KeptDrive:
-    return KeptDrive.of(simulated(STREET), sweep="compensated")
+    return KeptDrive.of(simulated(STREET), sweep="known")
 
 
 @cache
@@ -120,7 +120,7 @@ def test_pictures_of_another_street_are_refused() -> None:
 
 def test_without_a_guess_and_without_motion_nothing_is_claimed() -> None:
     small = simulated(dataclasses.replace(STREET, frames=2, width=414, height=125, azimuth_step_deg=0.5))
-    short = KeptDrive.of(small, sweep="compensated").with_images(no_mask).with_scans(no_classes)
+    short = KeptDrive.of(small, sweep="known").with_images(no_mask).with_scans(no_classes)
     result = calibrate(short, None)
     assert result.status == "unobservable"
     assert "a start is needed" in result.reasons[0]

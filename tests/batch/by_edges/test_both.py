@@ -54,7 +54,7 @@ def bare(frame: Frame) -> Frame:
 
 def with_labels_in(config: SimulationConfig, every: int, *, name: str = "street") -> KeptDrive:
     """A street with labels in every so many frames."""
-    kept = KeptDrive.of(simulated(config), sweep="compensated")
+    kept = KeptDrive.of(simulated(config), sweep="known")
     frames = tuple(f if k % every == 0 else bare(f) for k, f in enumerate(kept.frames))
     return replace(kept, frames=frames, name=name)
 

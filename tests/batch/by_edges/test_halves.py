@@ -39,7 +39,7 @@ COVARIANCE = np.diag(np.square([*np.radians([0.12] * 3), 0.015, 0.015, 0.015, 0.
 
 @cache
 def street() -> KeptDrive:
-    return KeptDrive.of(simulated(STREET), sweep="compensated")
+    return KeptDrive.of(simulated(STREET), sweep="known")
 
 
 def problem_of(drive: KeptDrive) -> tuple[JointProblem, State]:
@@ -72,6 +72,6 @@ def test_a_knock_is_named_though_the_estimate_fits_one_half() -> None:
 
 def test_short_drives_are_not_judged() -> None:
     """Six scans a half, though a knock is between them."""
-    short = KeptDrive.of(simulated(LENS_STREET), sweep="compensated")
+    short = KeptDrive.of(simulated(LENS_STREET), sweep="known")
     problem, state = problem_of(knocked(short, 3.0))
     assert halves_reasons(problem, state, COVARIANCE) == ()
