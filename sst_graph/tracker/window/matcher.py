@@ -137,9 +137,7 @@ class WindowMatcher:
             if len(pair)
         ]
 
-    def in_view(
-        self, point: Point, chosen: Collection[int], without: Collection[int]
-    ) -> dict[int, InView]:
+    def in_view(self, point: Point, chosen: Collection[int], without: Collection[int]) -> dict[int, InView]:
         """What should be visible of the objects of scans that have an image, by the scan's number.
 
         Args:
