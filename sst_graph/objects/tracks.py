@@ -21,20 +21,15 @@ ObjectId = tuple[int, SemanticClass, int]
 _Scalar = TypeVar("_Scalar", int, float)
 
 _REACH_M = 2.0
-"""Farthest an object's centre may seem to jump between scans, from where it stood or has driven to [m]."""
+"""Farthest an object's centre may seem to jump between scans [m]."""
 
 
 class ObjectTracker:
     """Tracks of objects, scan by scan; those not seen lately are forgotten.
 
-    An object of the last scan stands still, or moves on as it did between the last two scans; one that was
-    seen once may drive along with the LiDAR, as vehicles on a motorway do.
-
     Attributes:
         memory: scans after which an unseen track is forgotten, or None for never.
         live: class and place (3,) in the world [m] of each track, by its number.
-        steps: (3,) between the last two scans, of the tracks that both saw [m].
-        l_place: (3,) of the LiDAR at the last scan [m].
         last_seen: scan that saw it last, counted from 0.
         scans: scans so far.
         next_track: number of the next new track.
@@ -43,8 +38,6 @@ class ObjectTracker:
     def __init__(self, memory: int | None = None) -> None:
         self.memory = memory
         self.live: dict[int, tuple[SemanticClass, FloatArray]] = {}
-        self.steps: dict[int, FloatArray] = {}
-        self.l_place: FloatArray = np.zeros(3)
         self.last_seen: dict[int, int] = {}
         self.scans = 0
         self.next_track = 0
@@ -52,40 +45,25 @@ class ObjectTracker:
     def forget(self) -> None:
         """Forget all tracks; their numbers are not used again."""
         self.live.clear()
-        self.steps.clear()
         self.last_seen.clear()
 
     def add(self, boundaries: Mapping[SemanticClass, Boundaries], wTl: gtsam.Pose3) -> dict[ObjectName, int]:
         """Number of the track of each (class, object) of the next scan, posed at ``wTl``."""
         tracks: dict[ObjectName, int] = {}
         seen: dict[int, tuple[SemanticClass, FloatArray]] = {}
-        steps: dict[int, FloatArray] = {}
-        l_place = np.asarray(wTl.translation())
-        ahead = self._ahead(l_place - self.l_place)
         for (c, number), centre in object_centres(boundaries, wTl).items():
-            track = _nearest(self.live, ahead, seen, c, centre)
+            track = _nearest(self.live, seen, c, centre)
             if track is None:
                 track, self.next_track = self.next_track, self.next_track + 1
-            elif track in ahead:
-                steps[track] = centre - self.live[track][1]
             tracks[c, number] = track
             seen[track] = (c, centre)
             self.last_seen[track] = self.scans
         self.live.update(seen)
-        self.steps, self.l_place = steps, l_place
         self.scans += 1
         if self.memory is not None:
             for track in [t for t, last in self.last_seen.items() if last < self.scans - self.memory]:
                 del self.live[track], self.last_seen[track]
         return tracks
-
-    def _ahead(self, l_step: FloatArray) -> dict[int, FloatArray]:
-        """(3,) where the tracks of the last scan are now if they move, the LiDAR by ``l_step`` (3,) [m]."""
-        return {
-            track: place + self.steps.get(track, l_step)
-            for track, (_, place) in self.live.items()
-            if self.last_seen[track] == self.scans - 1
-        }
 
 
 def object_centres(
@@ -142,7 +120,6 @@ def scan_poses(drive: Drive) -> Sequence[gtsam.Pose3]:
 
 def _nearest(
     live: dict[int, tuple[SemanticClass, FloatArray]],
-    ahead: Mapping[int, FloatArray],
     taken: dict[int, tuple[SemanticClass, FloatArray]],
     c: SemanticClass,
     centre: FloatArray,
@@ -151,7 +128,7 @@ def _nearest(
     best, reach = None, _REACH_M
     for track, (track_class, place) in live.items():
         if track_class == c and track not in taken:
-            distance = min(float(np.linalg.norm(at - centre)) for at in (place, ahead.get(track, place)))
+            distance = float(np.linalg.norm(place - centre))
             if distance < reach:
                 best, reach = track, distance
     return best

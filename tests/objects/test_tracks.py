@@ -142,19 +142,6 @@ def test_a_tracker_forgets_and_keeps_classes_apart() -> None:
     assert len(set(both.values())) == 2 and 2 in both.values()
 
 
-def test_a_fast_vehicle_keeps_its_track() -> None:
-    """On a motorway vehicles move by more than an object may seem to jump; one that is parked at the roadside
-    is passed. The one ahead drives along when it is first seen, and goes on when the LiDAR brakes."""
-    tracker, place, seen = ObjectTracker(), 0.0, []
-    for k in range(SCANS):
-        wTl = gtsam.Pose3(gtsam.Rot3(), np.array([place, 0.0, 0.0]))
-        ahead, roadside = np.array([30.0 + 2.7 * k, 0.0, 0.0]), np.array([45.0, -8.0, 0.0])
-        found = tracker.add({VEHICLE: boundaries(wTl.transformTo(ahead), wTl.transformTo(roadside))}, wTl)
-        seen.append((found[VEHICLE, 0], found[VEHICLE, 1]))
-        place += max(2.6 - 0.3 * k, 0.0)
-    assert seen == [(0, 1)] * SCANS
-
-
 def test_too_few_matches_for_vehicles_that_all_move_say_so() -> None:
     """An oncoming one passes by faster than a track can follow."""
     for path, cause in (
