@@ -95,7 +95,7 @@ def test_one_small_run() -> None:
     )
     seen: list[tuple[str, int, int]] = []
     header, rule, row = accuracy.run(config, lambda *step: seen.append(step)).splitlines()
-    assert (header, rule) == (accuracy._HEADER, accuracy._RULE) and seen == [("standing", 1, 1)]
+    assert header == accuracy._HEADER and set(rule) == {"|", "-"} and seen == [("standing", 1, 1)]
     cells = [cell.strip() for cell in row.split("|")[1:-1]]
     assert cells[:3] == ["standing, 3 frames", "10", "0 (0)"]
     assert float(cells[3].split(" / ")[0]) < 0.5
