@@ -109,3 +109,7 @@ class SweepTiming:
             return float(turned(np.zeros(1), self.start_rad)[0])
         # A clockwise turn begins at q = 1.
         return float((self.stamp == "end") == (self.fraction > 0.0))
+
+
+AT_ONCE = SweepTiming(0.0, 0.0, 0.1)
+"""Of points that share one instant, or whose times are given."""

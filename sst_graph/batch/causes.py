@@ -49,24 +49,26 @@ def with_causes(
     may be wrong and does not show is a remark."""
     by_labels = config.method not in ("motion", "edges", "both")
     found = preflight(drives, guess, config.classes if by_labels else ())
-    said = tuple(
-        f"{drive.name}: {drive.sweep.contradiction}"
-        for drive in drives
-        if drive.sweep is not None and drive.sweep.contradiction
-    )
+    causes = [*_wrong_sweeps(drives), *(finding.sentence for finding in found)]
     estimated = bool(result.frames_used)
-    if not (found or said) and estimated:
+    if not causes and estimated:
         camera = other_camera(guess.cTl, result.T_camera_lidar, result.covariance)
-        found = () if camera is None else (camera,)
-    if not (found or said) and config.find_causes and config.method == "joint":
-        found = _suspected(result, drives, guess, config)
+        causes = [] if camera is None else [camera.sentence]
+    if not causes and config.find_causes and config.method == "joint":
+        causes = [finding.sentence for finding in _suspected(result, drives, guess, config)]
     if estimated and _relies_on_principal_point(config.assumptions):
         remark = uncalibrated(result.camera)
         result = result if remark is None else replace(result, reasons=(*result.reasons, remark.sentence))
-    if not (found or said):
+    if not causes:
         return result
-    reasons = (*said, *(finding.sentence for finding in found), *result.reasons)
-    return replace(result, status="not_converged" if estimated else result.status, reasons=reasons)
+    status = "not_converged" if estimated else result.status
+    return replace(result, status=status, reasons=(*causes, *result.reasons))
+
+
+def _wrong_sweeps(drives: Sequence[Drive]) -> list[str]:
+    """A sentence for each drive whose scans contradict what was said of their sweep."""
+    sweeps = [(drive.name, drive.sweep) for drive in drives if drive.sweep is not None]
+    return [f"{name}: {sweep.contradiction}" for name, sweep in sweeps if sweep.contradiction]
 
 
 def _relies_on_principal_point(assumptions: AssumptionConfig) -> bool:

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from sst_graph.types import FloatArray, IntArray
 
-_MAX_RINGS = 256
+MAX_RINGS = 256
+"""Most lasers of a LiDAR."""
 _BACK_RAD = np.radians(1.5)
 """A column begins where the elevation goes back by more: neighbours that are out of order by less are a near
 and a far return, from where the LiDAR was and where it is said to be."""
@@ -48,7 +49,7 @@ def rings_from_columns(points: NDArray[np.float32]) -> NDArray[np.uint16] | None
     if len(starts) < _FEWEST_COLUMNS or counts.mean() < _FEWEST_POINTS:
         return None
     longest = int(np.sort(counts)[-1 - int(_LONGEST_SHARE * len(counts))])
-    if longest > _MAX_RINGS or not _turns(np.arctan2(y, x)[starts]):
+    if longest > MAX_RINGS or not _turns(np.arctan2(y, x)[starts]):
         return None
     # 2. The block with most columns that have all beams, and from there to both sides.
     angles = down[np.minimum(np.arange(longest), counts[:, None] - 1) + starts[:, None]]

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.data.scan_columns import rings_from_columns
+from sst_graph.data.scan_columns import MAX_RINGS, rings_from_columns
 
-MAX_RINGS = 256
 MIN_POINTS_PER_RING = 8
 """Mean number of points in a ring below which rings are not accepted."""
 

@@ -9,11 +9,12 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
+from sst_graph.data.source import AT_THE_STAMP, TURNS
 from sst_graph.odometry.lidar import LidarOdometry
 from sst_graph.odometry.sweep.estimate import SweepEstimate, at_hypothesis, estimate, start_of
 from sst_graph.odometry.sweep.window import SECTORS, Window
 from sst_graph.sampling import evenly_spread
-from sst_graph.sweep_timing import LONGEST_TURN_S, SweepStamp, SweepTiming
+from sst_graph.sweep_timing import AT_ONCE, LONGEST_TURN_S, SweepStamp, SweepTiming
 from sst_graph.types import FloatArray, Scan
 
 _LOG = logging.getLogger(__name__)
@@ -24,12 +25,11 @@ SweepKind = Literal["compensated", "clockwise", "counterclockwise", "undecided",
 given."""
 FRACTIONS: dict[str, float] = {"compensated": 0.0, "clockwise": -1.0, "counterclockwise": 1.0}
 
-CLAIMS: dict[str, Hypothesis] = {
-    "compensated": "compensated",
-    "instant": "compensated",
-    "clockwise": "clockwise",
-    "azimuth": "clockwise",
-    "counterclockwise": "counterclockwise",
+CLAIMS: dict[str, str] = {
+    word: kind
+    for word in (*AT_THE_STAMP, *TURNS)
+    for kind, fraction in FRACTIONS.items()
+    if fraction == TURNS.get(word, 0.0)
 }
 """What may be said of the sweep (``--sweep``), as one of the hypotheses."""
 
@@ -144,8 +144,7 @@ class SweepDecision:
                 f"the scans are not as --sweep {word} says, but {self.sentence}: leave --sweep out, or say "
                 f"--sweep {self.kind}"
             )
-        untimed = SweepTiming(0.0, 0.0, 0.1)
-        return replace(self, kind="given", timing=untimed, others=(), contradiction=contradiction)
+        return replace(self, kind="given", timing=AT_ONCE, others=(), contradiction=contradiction)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able, for the diagnostics of a result."""

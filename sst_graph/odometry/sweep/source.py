@@ -14,7 +14,7 @@ from sst_graph.data.frame_parts import (
 from sst_graph.data.source_view import SourceView
 from sst_graph.errors import ConfigError
 from sst_graph.odometry.sweep.decision import CLAIMS, SweepDecision, decide_sweep
-from sst_graph.sweep_timing import SweepStamp, SweepTiming
+from sst_graph.sweep_timing import AT_ONCE, SweepStamp, SweepTiming
 from sst_graph.types import Frame, Scan, Source
 
 SWEEP_KEY = "sweep"
@@ -68,7 +68,7 @@ def with_sweep(source: Source, decide: bool = True) -> SweptSource:
     """
     if isinstance(source, SweptSource):
         return source
-    given, word = SweepDecision("given", SweepTiming(0.0, 0.0, 0.1)), getattr(source, "sweep", "auto")
+    given, word = SweepDecision("given", AT_ONCE), getattr(source, "sweep", "auto")
     if not decide or word not in ("auto", *CLAIMS):
         return SweptSource(source, given)
     ahead = AheadReader(source)
@@ -100,7 +100,7 @@ def with_sweep_of(source: Source, diagnostics: Mapping[str, Any]) -> SweptSource
     entry = entry.get(source.name, {}) if isinstance(entry, Mapping) else {}
     given = getattr(source, "sweep", "auto") != "auto"
     try:
-        timing = SweepTiming(0.0, 0.0, 0.1) if given else SweepTiming.from_dict(entry["timing"])
+        timing = AT_ONCE if given else SweepTiming.from_dict(entry["timing"])
     except (KeyError, TypeError, ValueError, ConfigError):
-        timing = SweepTiming(0.0, 0.0, 0.1)
+        timing = AT_ONCE
     return SweptSource(source, SweepDecision("given", timing))
