@@ -214,7 +214,14 @@ def unlabelled(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return bare.parents[1]
 
 
-@pytest.mark.parametrize("options", [[], ["--method", "auto", *AT_ONCE], ["--method", "edges", *AT_ONCE]])
+@pytest.mark.parametrize(
+    "options",
+    [
+        [],
+        pytest.param(["--method", "auto", *AT_ONCE], marks=pytest.mark.slow),
+        pytest.param(["--method", "edges", *AT_ONCE], marks=pytest.mark.slow),
+    ],
+)
 def test_a_drive_without_labels_is_tracked_by_edges(
     unlabelled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str]
 ) -> None:

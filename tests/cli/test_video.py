@@ -90,6 +90,7 @@ def test_bad_names(
     assert Path("note.mp4").read_text() == "mine" and len(list(tmp_path.iterdir())) == 1
 
 
+@pytest.mark.slow
 def test_calibrate_writes_one_into_its_folder_or_beside_it(street: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = [

@@ -159,6 +159,7 @@ def test_black_pictures_are_named_where_pictures_are_used(scale: int, reported: 
     assert not any("black" in sentence for sentence in causes(dark))
 
 
+@pytest.mark.slow
 def test_scans_that_are_given_twice_make_no_result_surer() -> None:
     for end, count in ((5, 0), (6, 1)):
         given = [replace(drive(), frames=drive().frames[part]) for part in (slice(0, end), slice(5, 10))]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 from streets import CROWDED_STREET
 
 from sst_graph import CalibrationConfig
@@ -22,6 +23,7 @@ def test_a_turned_calibration_has_fewer_close_points() -> None:
     assert max(turned[1:]) < 0.7 * estimate
 
 
+@pytest.mark.slow
 def test_by_edges_there_is_a_share_at_random_rotations() -> None:
     street = replace(CROWDED_STREET, frames=6)
     calibration = CalibrationConfig(method="edges")

@@ -88,6 +88,7 @@ def test_their_own_part() -> None:
     np.testing.assert_array_equal(again.common.errors["cy"], one.common.errors["cy"])
 
 
+@pytest.mark.slow
 def test_what_they_have_in_common_does_not_average_out() -> None:
     """Many fusions of eight drives: errors as the covariance says, which independent ones are not."""
     rng, squared, alone = np.random.default_rng(1), [], []

@@ -216,6 +216,7 @@ def test_the_start_of_a_fast_turn_is_found() -> None:
     assert abs((turned + 180.0) % 360.0 - 180.0) <= 10.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fraction", [0.0, -1.0])
 def test_an_object_that_drives_along_does_not_decide(fraction: float) -> None:
     """A truck beside the vehicle that no label tells from the static scene."""
@@ -424,6 +425,7 @@ def test_the_command_line_knows_both_senses(tmp_path: Path) -> None:
 # --- real drives ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.drives
 @pytest.mark.skipif(not PARKED.is_dir(), reason="no ../shared")
 @pytest.mark.parametrize(("cloud", "kind"), [("velodyne_raw", "clockwise"), ("velodyne", "compensated")])

@@ -116,6 +116,7 @@ def test_each_camera_is_as_good_as_alone() -> None:
     assert own.status == alone.status and own.camera_name == "right"
 
 
+@pytest.mark.slow
 def test_errors_within_the_joint_covariance() -> None:
     """NEES of all fourteen, and of the pose between the cameras, below their 99.9 % quantiles."""
     result = solved()
@@ -127,6 +128,7 @@ def test_errors_within_the_joint_covariance() -> None:
     assert abs(pose.time_offset_s) < 3.3 * pose.time_offset_sigma_s
 
 
+@pytest.mark.slow
 def test_the_cameras_err_alike() -> None:
     """Both see the same objects by the same points: their translations are positively correlated, and what is
     in common cancels in the pose between them."""
@@ -142,6 +144,7 @@ def test_the_cameras_err_alike() -> None:
     assert np.trace(pose.covariance) < np.trace(independent.covariance)
 
 
+@pytest.mark.slow
 def test_a_known_pose_improves_the_weaker_camera() -> None:
     marginal = solved().marginal()
     known = KnownRig((KnownPose("right", "left", _true_pose()),), one_trigger=True)
@@ -260,6 +263,7 @@ def test_what_is_no_rig_is_refused(given: dict, found: str) -> None:
         calibrate_rig(**{"cameras": dict(rig()), **given})
 
 
+@pytest.mark.slow
 def test_cameras_with_other_scans() -> None:
     """One scan fewer, and scans of other stamps."""
     drive = simulate(replace(STREET, frames=2))

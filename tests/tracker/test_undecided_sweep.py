@@ -80,6 +80,7 @@ def test_tracker_and_batch_agree_about_it(tmp_path: Path) -> None:
     assert told.estimate.sweep == given and told.result().reasons == ()
 
 
+@pytest.mark.slow
 def test_no_line_of_track_is_ok_where_the_sweep_is_open(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

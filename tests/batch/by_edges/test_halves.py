@@ -70,6 +70,7 @@ def test_a_knock_is_named_though_the_estimate_fits_one_half() -> None:
     assert "(pitch)" in other
 
 
+@pytest.mark.slow
 def test_short_drives_are_not_judged() -> None:
     """Six scans a half, though a knock is between them."""
     short = KeptDrive.of(simulated(LENS_STREET), sweep="known")
