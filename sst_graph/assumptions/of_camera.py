@@ -76,7 +76,7 @@ K1 = Assumption(
     source="what target calibrations leave in rectified pictures",
     span=0.3,
     violation="the pictures look distorted",
-    remedy="undistort the pictures and masks, give the camera's distortion, or estimate it with --estimate k1",
+    remedy="undistort the pictures and masks, give the camera's distortion, or use --estimate k1",
     prevalence=0.5,  # pictures come as they were taken about as often as undistorted
     by_edges=True,
 )
