@@ -28,6 +28,7 @@ RESULT_NAME = "calibration.json"
 REPORT_NAME = "report.html"
 
 CALIBRATION = OutputKind("calibration")
+OWN_CALIBRATION = "the data's own calibration and stamps (a reference, not the truth)"
 PICTURES = 3
 """Overlays of a calibration, over all its drives."""
 
@@ -44,8 +45,7 @@ def comparison(result: CalibrationResult, sources: Sequence[Source]) -> Comparis
         truth,
         None if reference else result.covariance,
     )
-    name = "the data's own calibration and stamps (a reference, not the truth)" if reference else "the truth"
-    return Comparison(errors, name)
+    return Comparison(errors, OWN_CALIBRATION if reference else "the truth")
 
 
 def write_calibration(

@@ -78,6 +78,36 @@ def test_evaluate_against_a_kitti_calibration(
     assert values["atd_m"] == pytest.approx(0.01) and values["time_offset_s"] is None
 
 
+def test_evaluate_against_the_data_set(
+    result_file: Path, kitti_drive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Read as the result was: one image late, 0.1 s."""
+    stored = json.loads(result_file.read_text())
+    result_file.write_text(json.dumps({**stored, "read_as": {"image_shift": 1}}))
+    data = kitti_drive.parents[1]
+    assert main(["evaluate", str(result_file), "--truth", str(data), "--json"]) == 0
+    captured = capsys.readouterr()
+    values = json.loads(captured.out)
+    assert values["atd_m"] == pytest.approx(0.01) and values["time_offset_s"] == pytest.approx(
+        0.004, abs=0.004
+    )
+    assert "--image-shift 1, as" in captured.err and "a reference, not the truth" in captured.err
+    truth = {"T_camera_lidar": stored["T_camera_lidar"], "time_offset_s": 0.0}
+    (kitti_drive / "groundtruth.json").write_text(json.dumps(truth))
+    assert main(["evaluate", str(result_file), "--truth", str(data), "--json"]) == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["atd_m"] == pytest.approx(0.0) and "reference" not in captured.err
+
+
+def test_evaluate_against_a_folder_that_holds_no_data(
+    result_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "empty").mkdir()
+    assert main(["evaluate", str(result_file), "--truth", str(tmp_path / "empty")]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and "found no layout that is known" in captured.err
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [

@@ -7,23 +7,21 @@ import dataclasses
 import json
 
 from sst_graph.cli.messages import complain, say
-from sst_graph.cli.reading import reading_words
+from sst_graph.cli.options import SOURCE_DEFAULTS
+from sst_graph.cli.outputs import OWN_CALIBRATION
+from sst_graph.cli.reading import open_drive_of, reading_words
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.inspect.report import error_lines
 from sst_graph.metrics import TruthSigma, calibration_errors
 from sst_graph.reference import read_reference
-from sst_graph.result import read_result
+from sst_graph.result import CalibrationResult, read_result, result_file
+from sst_graph.types import GroundTruth
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the errors of ``args.result`` against ``args.truth``."""
     result = read_result(args.result)
-    truth = read_reference(args.truth, result.camera_name)
-    if result.read_as.get("image_shift"):
-        complain(
-            f"warning: {args.result} was made with {reading_words(result.read_as)}: "
-            "the truth's time offset must be that of the same pairs"
-        )
+    truth = _truth(args, result)
     sigma = None if args.truth_sigma is None else _truth_sigma(args.truth_sigma)
     estimate = result.T_camera_lidar, result.time_offset_s
     errors = calibration_errors(*estimate, truth, result.covariance, sigma)
@@ -32,6 +30,28 @@ def run(args: argparse.Namespace) -> int:
     else:
         say("\n".join([*error_lines(errors), f"status       {result.status}"]))
     return 0
+
+
+def _truth(args: argparse.Namespace, result: CalibrationResult) -> GroundTruth:
+    """The truth in a file, or that of a data set, read as the drives of the result were.
+
+    Raises:
+        DataError: a file or data that cannot be read, or that bring none.
+    """
+    if args.truth.is_dir() and not result_file(args.truth).exists():
+        nothing_given = argparse.Namespace(**dict.fromkeys(SOURCE_DEFAULTS))
+        source = open_drive_of(nothing_given, args.truth, result, args.result)
+        if source.truth is None:
+            raise DataError(args.truth, "data without a calibration", "a groundtruth.json or the like")
+        if getattr(source, "truth_is_reference", False):
+            complain(f"note: {source.name}: {OWN_CALIBRATION}")
+        return source.truth
+    if result.read_as.get("image_shift"):
+        complain(
+            f"warning: {args.result} was made with {reading_words(result.read_as)}: "
+            "the truth's time offset must be that of the same pairs"
+        )
+    return read_reference(args.truth, result.camera_name)
 
 
 def _truth_sigma(text: str) -> TruthSigma:

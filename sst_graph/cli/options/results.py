@@ -18,7 +18,8 @@ def add_evaluate(commands: Commands) -> argparse.ArgumentParser:
         metavar="FILE",
         type=Path,
         required=True,
-        help="groundtruth.json, calibration.json, or a KITTI calib.txt (then without time offset)",
+        help="groundtruth.json, calibration.json, a KITTI calib.txt (then without time offset), or the data "
+        "set that RESULT was made of, whose truth or published calibration it is compared with",
     )
     evaluate.add_argument(
         "--truth-sigma",
