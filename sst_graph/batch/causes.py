@@ -17,6 +17,7 @@ from sst_graph.diagnosis import (
     other_camera,
     preflight,
     uncalibrated,
+    unknown_lasers,
 )
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
@@ -56,9 +57,12 @@ def with_causes(
         causes = [] if camera is None else [camera.sentence]
     if not causes and config.find_causes and config.method == "joint":
         causes = [finding.sentence for finding in _suspected(result, drives, guess, config)]
-    if estimated and _relies_on_principal_point(config.assumptions):
-        remark = uncalibrated(result.camera)
-        result = result if remark is None else replace(result, reasons=(*result.reasons, remark.sentence))
+    if estimated:
+        remarks = [unknown_lasers(drives) if config.method != "motion" else None]
+        if _relies_on_principal_point(config.assumptions):
+            remarks.append(uncalibrated(result.camera))
+        told = (remark.sentence for remark in remarks if remark is not None)
+        result = replace(result, reasons=(*result.reasons, *told))
     if not causes:
         return result
     status = "not_converged" if estimated else result.status

@@ -11,6 +11,17 @@ from sst_graph.diagnosis.cameras import uncalibrated
 from sst_graph.diagnosis.causes import likely_causes, mirror, preflight
 from sst_graph.diagnosis.finding import Finding
 from sst_graph.diagnosis.fit import Fit, Fitter
+from sst_graph.diagnosis.lasers import unknown_lasers
 from sst_graph.diagnosis.poses import other_camera
 
-__all__ = ["Finding", "Fit", "Fitter", "likely_causes", "mirror", "other_camera", "preflight", "uncalibrated"]
+__all__ = [
+    "Finding",
+    "Fit",
+    "Fitter",
+    "likely_causes",
+    "mirror",
+    "other_camera",
+    "preflight",
+    "uncalibrated",
+    "unknown_lasers",
+]

@@ -68,6 +68,7 @@ class ScanStatistics:
         vehicle_heights: (k,) from the ground to the top of its vehicles.
         sample: (s,) sorted numbers of some points, chosen and numbered by their coordinates: a point that is
             equal to the last bit in two scans is in both samples or in none.
+        lasers: whether the data tell by which laser each point was measured; of a scan without points, too.
     """
 
     index: int
@@ -78,6 +79,7 @@ class ScanStatistics:
     ground: Ground | None = None
     vehicle_heights: FloatArray = field(default_factory=lambda: np.zeros(0))
     sample: NDArray[np.uint64] = field(default_factory=lambda: np.zeros(0, np.uint64))
+    lasers: bool = True
 
     def hash(self) -> str:
         """Of its points: 16 hexadecimal digits, the same wherever the scan is read."""
@@ -165,7 +167,8 @@ def scan_statistics(index: int, scan: Scan, closely: bool = True) -> ScanStatist
     labelled = _counts(scan.classes)
     digest = zlib.crc32(np.ascontiguousarray(scan.points).tobytes())
     sample = _sample(scan.points)
-    return ScanStatistics(index, scan.stamp_ns, digest, sweep, labelled, ground, heights, sample)
+    lasers = scan.rings is not None or not len(points)
+    return ScanStatistics(index, scan.stamp_ns, digest, sweep, labelled, ground, heights, sample, lasers)
 
 
 _FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)

@@ -29,6 +29,14 @@ _APART = 10.0
 """Distance of two rings among the keys that points are sorted by; azimuths differ by less [rad]."""
 _FAR_STRIP, _FAR_SHARE = np.radians(1.0), 0.1
 """Strips of elevations [rad] in which less than this share of the points is far show their rings by all."""
+_HEIGHTS_M = np.linspace(-0.3, 0.4, 36)
+"""Heights that are tried for the tips of all cones [m]: 0.2 of an HDL-64E."""
+_NEAREST_M, _HEIGHT_POINTS = 3.0, 20_000
+"""The height is looked for with points beyond so many metres, about so many of them."""
+_PARTS_OF_RINGS, _STRIPS_OF_RINGS = 400, 20
+"""Shares of the points that are less than a ring, and some rings, of 16 to 128."""
+_LEAST_GAP = 1e-5
+"""Slopes are not told apart below this: float32 of points far away."""
 _MIN_RHO_RATIO = 1.5
 """A cone's height is fitted only where the ring's far points are this much farther than its near ones."""
 
@@ -67,13 +75,16 @@ def arrange_beams(points: FloatArray, rings: NDArray[np.integer] | None) -> Beam
     """Order points (n, 3) [m] by laser and azimuth and fit the cones.
 
     Args:
-        rings: (n,) laser of each point, or None: then rings are recovered from the elevations.
+        rings: (n,) laser of each point, or None: then rings are recovered from the elevations, as seen from
+            where most cones have their tip.
     """
     rho = np.sqrt(points[:, 0] ** 2 + points[:, 1] ** 2)
     azimuth = np.arctan2(points[:, 1], points[:, 0])
     slope = points[:, 2] / np.maximum(rho, 1e-6)
-    labels = recover_rings(np.arctan(slope), rho) if rings is None else rings
-    ring, counts, median_slope = _rank_by_slope(labels, slope)
+    if rings is None:
+        above = points[:, 2] - common_height(points[:, 2], rho)
+        rings = recover_rings(np.arctan(above / np.maximum(rho, 1e-6)), rho)
+    ring, counts, median_slope = _rank_by_slope(rings, slope)
     keys = Beams.key(ring, azimuth)
     order = np.argsort(keys, kind="stable")  # points come nearly in order
     in_order = keys[order]
@@ -83,6 +94,27 @@ def arrange_beams(points: FloatArray, rings: NDArray[np.integer] | None) -> Beam
     some = order[_evenly_from_each(counts)]
     height = _cone_heights(points[some, 2], rho[some], counts)
     return Beams(order, in_order, ring, azimuth, rho, height, step, np.arctan(median_slope))
+
+
+def common_height(z: FloatArray, rho: FloatArray) -> float:
+    """Height of the cones' tips, one for all, from which rings stand out most [m]; z, rho: (n,) [m].
+
+    Along the sorted slopes, points of a ring are then close together in comparison with points some rings
+    apart. Gaps are compared by their logarithms, so that no scale of the slopes is preferred.
+    """
+    some = np.flatnonzero(rho > _NEAREST_M)
+    some = some[:: 1 + len(some) // _HEIGHT_POINTS]
+    near, apart = len(some) // _PARTS_OF_RINGS, len(some) // _STRIPS_OF_RINGS
+    if near < 1:
+        return 0.0
+
+    def clearness(height: float) -> float:
+        slope = np.sort((z[some] - height) / rho[some])
+        gaps = (np.maximum(slope[step:] - slope[:-step], _LEAST_GAP) for step in (apart, near))
+        wide, narrow = (float(np.log(gap).mean()) for gap in gaps)
+        return wide - narrow
+
+    return float(max(_HEIGHTS_M, key=clearness))
 
 
 def recover_rings(elevation: FloatArray, rho: FloatArray) -> IntArray:

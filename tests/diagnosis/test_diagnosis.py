@@ -25,6 +25,7 @@ from sst_graph.diagnosis.clocks import stamps, two_clocks
 from sst_graph.diagnosis.hypotheses import best_hypothesis
 from sst_graph.diagnosis.poses import wrong_start
 from sst_graph.diagnosis.units import axes
+from sst_graph.drive.input_statistics import InputStatistics, scan_statistics
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
@@ -362,6 +363,35 @@ def test_it_is_a_remark_unless_it_is_said_how_far_it_may_be_off() -> None:
     (remark,) = reasons()
     assert remark.startswith("the principal point is the middle of the picture")
     assert reasons(cy=8.0) == reasons(estimate=("cx=5",)) == ()
+
+
+def test_clouds_that_do_not_name_the_laser_of_a_point_are_remarked_on() -> None:
+    """Where labels or edges rely on rings, and only where most scans lack them."""
+    guess = Guess(drive().nominal, 0.0)
+
+    def reasons(nameless: int, method: str = "joint") -> tuple[str, ...]:
+        scans = [
+            replace(frame.scan, rings=None) if frame.scan is not None and k < nameless else frame.scan
+            for k, frame in enumerate(drive())
+        ]
+        statistics = InputStatistics(
+            tuple(scan_statistics(k, s, False) for k, s in enumerate(scans) if s), ()
+        )
+        drives = [replace(prepared, statistics=statistics) for prepared in known]
+        config = CalibrationConfig(method=method, find_causes=False)
+        result = replace(guess_as_result(drives, guess, config, "first"), status="ok")
+        said = with_causes(replace(result, frames_used=(FrameId("street", 0),)), drives, guess, config)
+        assert said.status == "ok"
+        return said.reasons[1:]
+
+    known = prepare_drives([swept(drive())], CalibrationConfig())
+    (remark,) = reasons(10)
+    assert "10 of 10 scans have no field 'ring'" in remark
+    assert short_reason(remark).endswith(
+        "give the clouds with the field 'ring', or as the LiDAR's driver stores them"
+    )
+    assert reasons(10, "edges") == (remark,)
+    assert reasons(10, "motion") == reasons(2) == reasons(0) == ()
 
 
 @pytest.mark.parametrize(("scale", "name"), [(0.5, "half"), (2.0, "twice"), (0.25, "about 0.26 times")])

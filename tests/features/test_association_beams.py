@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sst_graph.features.lidar_beams import arrange_beams, recover_rings
+from sst_graph.features.lidar_beams import arrange_beams, common_height, recover_rings
 
 ELEVATIONS = np.radians([-14.0, -11.5, -9.0, -7.0, -5.0, -3.0, -1.5, 0.5])
 HEIGHTS = np.array([0.21, 0.18, 0.2, 0.15, 0.12, 0.14, 0.1, 0.11])
@@ -71,6 +71,20 @@ def test_rings_without_numbers() -> None:
     assert mode == sorted(set(mode))
 
 
+def test_rings_without_numbers_of_lasers_far_above_the_origin() -> None:
+    """64 rings 0.4 deg apart whose cones have their tips 0.2 m above the origin, as of an HDL-64E:
+    near points are up to seven rings higher, as seen from the origin."""
+    rng = np.random.default_rng(8)
+    rank = rng.integers(0, 64, 60_000)
+    azimuth, rho = rng.uniform(-0.7, 0.7, len(rank)), rng.uniform(4.0, 40.0, len(rank))
+    z = 0.2 + np.tan(np.radians(-24.0 + 0.41 * rank)) * rho + rng.normal(0.0, 0.005, len(rank))
+    points = np.stack([rho * np.cos(azimuth), rho * np.sin(azimuth), z], axis=1)
+    assert common_height(z, rho) == pytest.approx(0.2, abs=0.011)
+    found = arrange_beams(points, None).ring
+    assert sum(np.bincount(found[rank == k]).max() for k in range(64)) > 0.97 * len(rank)
+    assert sum(np.bincount(rank[found == k]).max() for k in np.unique(found)) > 0.97 * len(rank)
+
+
 def test_rings_that_meet_the_ground_before_any_far_point() -> None:
     """From 1.8 m all below -13 deg do; the others see walls of all distances."""
     rank = np.tile(np.arange(24), 500)
@@ -93,6 +107,7 @@ def test_a_sensor_without_rings_gets_strips() -> None:
 
 def test_nothing() -> None:
     assert len(recover_rings(np.zeros(0), np.zeros(0))) == 0
+    assert common_height(np.zeros(0), np.zeros(0)) == 0.0
     beams = arrange_beams(np.zeros((0, 3)), None)
     assert len(beams.order) == 0 and beams.step == 0.0
 
