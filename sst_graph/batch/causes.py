@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from sst_graph.assumptions import held_at_zero
@@ -56,13 +56,10 @@ def with_causes(
         camera = other_camera(guess.cTl, result.T_camera_lidar, result.covariance)
         causes = [] if camera is None else [camera.sentence]
     if not causes and config.find_causes and config.method == "joint":
-        causes = [finding.sentence for finding in _suspected(result, drives, guess, config)]
+        causes = [finding.sentence for finding in _fault_hypotheses(result, drives, guess, config)]
     if estimated:
-        remarks = [unknown_lasers(drives) if config.method != "motion" else None]
-        if _relies_on_principal_point(config.assumptions):
-            remarks.append(uncalibrated(result.camera))
-        told = (remark.sentence for remark in remarks if remark is not None)
-        result = replace(result, reasons=(*result.reasons, *told))
+        remarks = (remark.sentence for remark in _remarks(result, drives, config))
+        result = replace(result, reasons=(*result.reasons, *remarks))
     if not causes:
         return result
     status = "not_converged" if estimated else result.status
@@ -75,13 +72,23 @@ def _wrong_sweeps(drives: Sequence[Drive]) -> list[str]:
     return [f"{name}: {sweep.contradiction}" for name, sweep in sweeps if sweep.contradiction]
 
 
+def _remarks(
+    result: CalibrationResult, drives: Sequence[Drive], config: CalibrationConfig
+) -> Iterator[Finding]:
+    """What may be wrong with the data of an estimate, and does not show."""
+    if config.method != "motion" and (lasers := unknown_lasers(drives)) is not None:
+        yield lasers
+    if _relies_on_principal_point(config.assumptions) and (centre := uncalibrated(result.camera)) is not None:
+        yield centre
+
+
 def _relies_on_principal_point(assumptions: AssumptionConfig) -> bool:
     """Whether it is neither estimated nor said how far it may be off."""
     usual, held = AssumptionConfig(), held_at_zero(assumptions.estimate)
     return all(name in held and assumptions.sigma(name) <= usual.sigma(name) for name in ("cx", "cy"))
 
 
-def _suspected(
+def _fault_hypotheses(
     result: CalibrationResult, drives: Sequence[Drive], guess: Guess, config: CalibrationConfig
 ) -> tuple[Finding, ...]:
     """What explains a result that is missing, may be wrong, or agrees with few of the labels."""

@@ -16,7 +16,7 @@ from sst_graph.data.frame_parts import RecentReader
 from sst_graph.files import OutputKind
 from sst_graph.inspect.inspection import inspect_result, to_dict
 from sst_graph.inspect.reasons import short_reasons
-from sst_graph.inspect.report import Comparison, markdown_report
+from sst_graph.inspect.report import OWN_CALIBRATION, Comparison, markdown_report
 from sst_graph.metrics import calibration_errors
 from sst_graph.odometry.sweep import with_sweep_of
 from sst_graph.report import ReportInputs, report_html
@@ -28,7 +28,6 @@ RESULT_NAME = "calibration.json"
 REPORT_NAME = "report.html"
 
 CALIBRATION = OutputKind("calibration")
-OWN_CALIBRATION = "the data's own calibration and stamps (a reference, not the truth)"
 PICTURES = 3
 """Overlays of a calibration, over all its drives."""
 

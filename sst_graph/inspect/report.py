@@ -32,6 +32,10 @@ _WITHOUT_LABELS = (
 """What the parts of the sigmas mean."""
 
 
+OWN_CALIBRATION = "the data's own calibration and stamps (a reference, not the truth)"
+"""Name of what a drive without a known truth is compared with."""
+
+
 @dataclass(frozen=True)
 class Comparison:
     """Errors against a calibration that is known.

@@ -8,10 +8,9 @@ import json
 
 from sst_graph.cli.messages import complain, say
 from sst_graph.cli.options import SOURCE_DEFAULTS
-from sst_graph.cli.outputs import OWN_CALIBRATION
 from sst_graph.cli.reading import open_drive_of, reading_words
 from sst_graph.errors import ConfigError, DataError
-from sst_graph.inspect.report import error_lines
+from sst_graph.inspect.report import OWN_CALIBRATION, error_lines
 from sst_graph.metrics import TruthSigma, calibration_errors
 from sst_graph.reference import read_reference
 from sst_graph.result import CalibrationResult, read_result, result_file

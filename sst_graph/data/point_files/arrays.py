@@ -78,7 +78,7 @@ def read_npz(data: bytes, path: Path) -> Cloud:
                 with archive.open(member) as stream:
                     content = stream.read(member.file_size + 1)
                 arrays[member.filename.removesuffix(".npy")] = _array(content, path)
-    except (*_BROKEN, NotImplementedError, RuntimeError) as error:
+    except (*_BROKEN, RuntimeError) as error:
         raise DataError(path, f"no .npz file ({first_line(error)})", "arrays that NumPy wrote") from None
     for name, array in arrays.items():
         fields.update(_fields(array, path) if name == "points" else {name: array})

@@ -394,7 +394,7 @@ def _members(archive: bytes, path: str | Path) -> tuple[str, memoryview]:
             text = bytes(head).decode("ascii")
     except (zipfile.BadZipFile, zlib.error, ArithmeticError, LookupError, OSError, RuntimeError) as error:
         raise _unreadable(path, error) from error
-    except (EOFError, MemoryError, NotImplementedError, ValueError) as error:
+    except (EOFError, MemoryError, ValueError) as error:
         raise _unreadable(path, error) from error
     if _digest(head, data) != bytes(digest):
         raise CheckpointError(path, "no readable checkpoint (another checksum)", "one as it was written")
