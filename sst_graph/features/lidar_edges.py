@@ -3,8 +3,8 @@
 The edge lies between the last return on the object and the next beam, so the direction half way is
 unbiased, uniform over half a beam step to either side. Where the neighbour is *nearer* the edge belongs
 to the neighbour and is skipped. The range is extrapolated over the half step with the slope of the last
-two returns, and along a roof that is seen from above: at a grazing angle it ends well behind the last
-return, and a camera beside the LiDAR sees the difference.
+two returns. A roof that is seen from above is curved, and ends where a ray touches it, well behind the last
+return: a camera below the LiDAR sees the difference.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ _GROUND_MARGIN_M = 0.3
 """What is lower than an object's lowest points plus this is the ground below it [m]."""
 _MAX_SLOPE_M = 1.0
 """Most that the range is extrapolated by the slope of the last two returns [m]."""
-_MAX_ROOF_M = 0.6
-"""Most that it is extrapolated along a roof, from a return anywhere on it to where a camera a little lower
-loses sight of it [m]."""
+_ROOF_RADIUS_M = 2.0
+"""Radius of curvature of roofs seen from above [m]: between 1.6 and 3 on cars of three simulators
+(docs/measured/simulators.md)."""
 _ROOF_BEAMS = 2
 """Beams to either side of a point on a roof that hit the object, too."""
 _CELL_M = 0.3
@@ -250,7 +250,7 @@ def _ring_edges(
     below: the object ends where that ring meets the ground, no matter how far before or behind.
 
     Args:
-        roofs: whether objects of the class have one: seen from above, they end at its far end.
+        roofs: whether objects of the class have one: seen from above, they end where a ray touches it.
     """
     mask = seen.mask
     up = 1 if ground is None else -1
@@ -274,8 +274,8 @@ def _ring_edges(
     before, known = _nearest_in_ring(beams, i, beams.ring[i] - up)
     push = _extrapolated(beams, i, before, known & mask[before])
     if roofs:
-        along = _along_roof(0.5 * gap, 0.5 * (slope + slope_there), slope)
-        push = np.maximum(push, np.where(_within_object(mask, beams, i), along, 0.0))
+        roof = (slope < 0.0) & _within_object(mask, beams, i)
+        push = np.where(roof, _to_tangent(gap, _ROOF_RADIUS_M), push)
     edge = _along_rays(points, beams, i, push)
     half = 0.5 * (gap + push * (slope_there - slope))
     lPs, outward = edge.copy(), edge.copy()
@@ -287,18 +287,16 @@ def _ring_edges(
     return _Edges(i, lPs, outward, kinds)
 
 
-def _along_roof(half: FloatArray, middle: FloatArray, slope: FloatArray) -> FloatArray:
-    """(n,) how far behind the last return the ray half way to the ring above comes down to its height [m].
+def _to_tangent(gap: FloatArray, radius_m: float) -> FloatArray:
+    """(n,) mean distance along a ray from its return on a curved surface to where the surface ends for it [m].
 
-    A roof seen from above at a grazing angle ends somewhere between the returns of two rings that are metres
-    apart on it, and the upper one misses it; the slope of the last two returns is that of the rear window.
+    A return that lies h below the tangent to a surface of radius R is sqrt(2 R h) nearer than the point of
+    contact; h is uniform between nothing and the gap between two rings.
 
     Args:
-        half: (n,) height of that ray above the last return, at its range [m].
-        middle, slope: (n,) slopes of that ray and of the last return's.
+        gap: (n,) distance of the two rings there [m].
     """
-    down = np.where(middle < 0.0, half / np.maximum(-middle, 1e-9), np.inf)
-    return np.where(slope < 0.0, np.minimum(down, _MAX_ROOF_M), 0.0)
+    return np.asarray(2.0 / 3.0 * np.sqrt(2.0 * radius_m * np.maximum(gap, 0.0)))
 
 
 def _within_object(mask: NDArray[np.bool_], beams: Beams, index: IntArray) -> NDArray[np.bool_]:

@@ -120,30 +120,45 @@ def test_the_range_is_carried_on() -> None:
     np.testing.assert_allclose(rho[azimuth < 0.0], recedes[members[0]] - 0.15, atol=1e-3)
 
 
+ROOF_RADIUS_M, ROOF_TOP_M, ROOF_AT_M = 2.0, -0.3, 9.0
+
+
 def roof(phase_deg: float, label: SemanticClass) -> Scan:
-    """A box 0.3 m below the LiDAR from 8 to 9.2 m away, with a flat roof, before a wall."""
+    """A cylinder that lies across the view, its highest line 0.3 m below the LiDAR and 9 m away, before a wall."""
     azimuth, elevation = (a.ravel() for a in np.meshgrid(AZIMUTHS, ELEVATIONS + np.radians(phase_deg)))
     ring = np.repeat(np.arange(len(ELEVATIONS)), len(AZIMUTHS))
     height = np.tan(elevation)
-    on_roof = np.where(height < 0.0, -0.3 / np.minimum(height, -1e-6), np.inf)
-    rho = np.where(on_roof <= 8.0, 8.0, np.where(on_roof < 9.2, on_roof, 40.0))
+    # The nearer intersection of z = height * rho with the circle.
+    middle = ROOF_TOP_M - ROOF_RADIUS_M
+    a, b = 1.0 + height**2, ROOF_AT_M + height * middle
+    root = b**2 - a * (ROOF_AT_M**2 + middle**2 - ROOF_RADIUS_M**2)
+    rho = np.where(root >= 0.0, (b - np.sqrt(np.maximum(root, 0.0))) / a, 40.0)
     points = np.stack([rho * np.cos(azimuth), rho * np.sin(azimuth), rho * height], axis=1)
     classes = np.where(rho < 11.0, label, OTHER).astype(np.uint8)
     return Scan(0, points.astype(np.float32), classes, rings=ring.astype(np.uint16))
 
 
-def test_a_roof_seen_from_above_ends_behind_its_last_return() -> None:
-    """A camera 8 cm lower sees the far end; in the mean over where the rings fall, so does the edge."""
-    truth, errors = (-0.3 + 0.08) / 9.2, dict[SemanticClass, float]()
+def tangent_slope(eye_m: float) -> float:
+    """Slope of the ray that touches the roof from ``eye_m`` above the LiDAR."""
+    down = ROOF_TOP_M - ROOF_RADIUS_M - eye_m
+    angle = np.arctan2(down, ROOF_AT_M) + np.arcsin(ROOF_RADIUS_M / np.hypot(ROOF_AT_M, down))
+    return float(np.tan(angle))
+
+
+@pytest.mark.parametrize("lower_m", [0.08, 0.35])
+def test_a_roof_seen_from_above_ends_behind_its_last_return(lower_m: float) -> None:
+    """In the mean over where the rings fall, a camera below the LiDAR sees the edge where the roof ends."""
+    errors = dict[SemanticClass, float]()
     for label in (VEHICLE, SemanticClass.BUILDING):
         slopes = []
-        for phase in np.arange(0.0, RING_DEG, 0.02):
+        for phase in np.arange(0.01, RING_DEG, 0.02):
             top = find_boundaries(roof(phase, label), [label])[label]
             top = top.take(np.flatnonzero(top.edges == Edge.TOP))
             assert len(top) == len(AZIMUTHS)
-            slopes.append(np.mean((top.lPs[:, 2] + 0.08) / np.hypot(top.lPs[:, 0], top.lPs[:, 1])))
-        errors[label] = 721.0 * abs(float(np.mean(slopes)) - truth)
-    assert errors[VEHICLE] < 0.15 < 0.4 < errors[SemanticClass.BUILDING]  # px
+            slopes.append(np.mean((top.lPs[:, 2] + lower_m) / np.hypot(top.lPs[:, 0], top.lPs[:, 1])))
+        errors[label] = 721.0 * abs(float(np.mean(slopes)) - tangent_slope(-lower_m))
+    assert errors[VEHICLE] < 0.1  # px
+    assert 4.0 * errors[VEHICLE] < errors[SemanticClass.BUILDING]
 
 
 def test_rays_leave_the_tip_of_their_ring() -> None:
