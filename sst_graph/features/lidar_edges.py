@@ -36,9 +36,9 @@ _GROUND_MARGIN_M = 0.3
 """What is lower than an object's lowest points plus this is the ground below it [m]."""
 _MAX_SLOPE_M = 1.0
 """Most that the range is extrapolated by the slope of the last two returns [m]."""
-_ROOF_RADIUS_M = 2.0
-"""Radius of curvature of roofs seen from above [m]: between 1.6 and 3 on cars of three simulators
-(docs/measured/simulators.md)."""
+_ROOF_RADIUS_M = 3.0
+"""Radius of curvature of roofs seen from above [m]: a car's is 4 cm lower half a metre from its middle. What
+another radius and flat roofs cost: docs/measured/simulators.md."""
 _ROOF_BEAMS = 2
 """Beams to either side of a point on a roof that hit the object, too."""
 _CELL_M = 0.3
@@ -288,7 +288,7 @@ def _ring_edges(
 
 
 def _to_tangent(gap: FloatArray, radius_m: float) -> FloatArray:
-    """(n,) mean distance along a ray from its return on a curved surface to where the surface ends for it [m].
+    """(n,) mean distance along a ray from its return on a curved surface to where rays just touch it [m].
 
     A return that lies h below the tangent to a surface of radius R is sqrt(2 R h) nearer than the point of
     contact; h is uniform between nothing and the gap between two rings.
