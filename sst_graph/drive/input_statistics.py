@@ -31,7 +31,6 @@ _OBJECT_POINTS = 60
 """Points of a vehicle from which its size is taken."""
 _CELL = 0.02
 """Grid cell that splits points into objects, as a share of their median range: free of the unit."""
-_GROUND = (int(SemanticClass.GROUND), int(SemanticClass.TERRAIN))
 
 
 @dataclass(frozen=True)
@@ -159,7 +158,7 @@ def scan_statistics(index: int, scan: Scan, closely: bool = True) -> ScanStatist
         sweep = float(np.ptp(np.asarray(scan.offsets_s, np.float64)))
     ground, heights = None, np.zeros(0)
     if closely:
-        on_ground = np.isin(scan.classes, _GROUND)
+        on_ground = _labelled_ground(scan.classes)
         ground = _ground(points[on_ground], points[~on_ground])
         member = (scan.classes == int(SemanticClass.VEHICLE)) & (ranges < 2.0 * median_range)
         instances = None if scan.instances is None else scan.instances[member]
@@ -227,6 +226,14 @@ def _places(count: int) -> FloatArray:
 def _counts(classes: NDArray[np.uint8]) -> dict[int, int]:
     counts = np.bincount(classes.ravel(), minlength=1)
     return {int(c): int(counts[c]) for c in np.flatnonzero(counts)}
+
+
+def _labelled_ground(classes: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """(n,) the points labelled ground; where these are few, with terrain, which may be a bank or rocks."""
+    ground = np.asarray(classes == int(SemanticClass.GROUND))
+    if np.count_nonzero(ground) >= _LEAST_POINTS:
+        return ground
+    return np.asarray(ground | (classes == int(SemanticClass.TERRAIN)))
 
 
 def _ground(points: FloatArray, others: FloatArray) -> Ground | None:
