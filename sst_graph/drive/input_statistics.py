@@ -100,6 +100,7 @@ class ImageStatistics:
         rows: mean row of each class's pixels, as a share of the image's height.
         profiles: what the picture shows along the mask's contours, and beside them.
         brightest: largest value of the picture, 0 to 255; None where there is none.
+        rectified: whether it was taken by a lens, and its camera is the pinhole that this package chose.
     """
 
     index: int
@@ -109,6 +110,7 @@ class ImageStatistics:
     rows: Mapping[int, float]
     profiles: tuple[ContourProfile, ...] = ()
     brightest: int | None = None
+    rectified: bool = False
 
 
 @dataclass(frozen=True)
@@ -202,6 +204,7 @@ def image_statistics(index: int, image: CameraImage, closely: bool = True) -> Im
         {c: row / height for c, row in rows.items()},
         contour_profiles(image.mask, image.pixels, SemanticClass.VEHICLE) if closely and shows else (),
         int(image.pixels.max()) if image.has_picture else None,
+        image.stretch is not None,
     )
 
 
