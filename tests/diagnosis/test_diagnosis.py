@@ -228,6 +228,20 @@ def test_no_vehicle_drives_like_that(speeds: np.ndarray, words: str | None) -> N
         assert found is not None and words in found.evidence and "run too slowly" in found.cause
 
 
+@pytest.mark.parametrize("timeless", [(0,), (3, 4), ()])
+def test_scans_without_times_among_scans_with_times(timeless: tuple[int, ...]) -> None:
+    """Whether they lack the field, or all of its values are 0."""
+    statistics = prepared().statistics
+    assert statistics is not None
+    scans = [replace(scan, sweep_s=0.0 if k in timeless else 0.1) for k, scan in enumerate(statistics.scans)]
+    said = preflight(
+        [replace(prepared(), statistics=replace(statistics, scans=tuple(scans)))], Guess(None, 0.0), ()
+    )
+    found = [finding.evidence for finding in said if "times of their points" in finding.cause]
+    some = "1 of 10 scans have none" if len(timeless) == 1 else "2 of 10 scans have none"
+    assert found == ([f"{some}, or all of them equal"] if timeless else [])
+
+
 def test_single_stamps_that_are_off_are_no_second_clock() -> None:
     """A lost image with the numbering going on, a late frame now and then: the intervals agree otherwise."""
     late = [0, 0, 0, 80, 0, 100, 100, 100, 100, 100]
