@@ -78,8 +78,17 @@ def _remarks(
     """What may be wrong with the data of an estimate, and does not show."""
     if config.method != "motion" and (lasers := unknown_lasers(drives)) is not None:
         yield lasers
-    if _relies_on_principal_point(config.assumptions) and (centre := uncalibrated(result.camera)) is not None:
+    stated = any(_taken_as_given(drive) for drive in drives) and _relies_on_principal_point(
+        config.assumptions
+    )
+    if stated and (centre := uncalibrated(result.camera)) is not None:
         yield centre
+
+
+def _taken_as_given(drive: Drive) -> bool:
+    """Whether the camera of the pictures is that of the data, and not one to which they were rectified."""
+    images = () if drive.statistics is None else drive.statistics.images
+    return not any(image.rectified for image in images)
 
 
 def _relies_on_principal_point(assumptions: AssumptionConfig) -> bool:

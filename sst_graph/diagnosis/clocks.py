@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sst_graph.diagnosis.finding import Finding
 from sst_graph.drive.preparation import Drive
+from sst_graph.errors import count_of
 from sst_graph.timestamps import FAR_APART_S, NS_PER_S, apart_s
 from sst_graph.types import FloatArray
 
@@ -74,6 +75,20 @@ def apart(drive: Drive, time_offset_s: float) -> Finding | None:
         "no image is of the time of the scans",
         f"scans {spans[0]}, images {spans[1]}",
         "write the stamps of both by one clock, or give the time offset by --init FILE",
+    )
+
+
+def point_times(drive: Drive) -> Finding | None:
+    """Scans with times of their points beside scans without: the points of the latter count as measured at
+    once, and those of the same scanner are not."""
+    scans = () if drive.statistics is None else drive.statistics.scans
+    timed = [scan.sweep_s > 0.0 for scan in scans if sum(scan.labelled.values()) > 1]
+    if all(timed) or not any(timed):
+        return None
+    return Finding(
+        "some scans have times of their points, others have none",
+        f"{timed.count(False)} of {count_of(len(timed), 'scan')} have none, or all of them equal",
+        "give the times of all scans, or of none and say --sweep compensated, clockwise or counterclockwise",
     )
 
 

@@ -31,7 +31,6 @@ _OBJECT_POINTS = 60
 """Points of a vehicle from which its size is taken."""
 _CELL = 0.02
 """Grid cell that splits points into objects, as a share of their median range: free of the unit."""
-_GROUND = (int(SemanticClass.GROUND), int(SemanticClass.TERRAIN))
 
 
 @dataclass(frozen=True)
@@ -101,6 +100,7 @@ class ImageStatistics:
         rows: mean row of each class's pixels, as a share of the image's height.
         profiles: what the picture shows along the mask's contours, and beside them.
         brightest: largest value of the picture, 0 to 255; None where there is none.
+        rectified: whether it was taken by a lens, and its camera is the pinhole that this package chose.
     """
 
     index: int
@@ -110,6 +110,7 @@ class ImageStatistics:
     rows: Mapping[int, float]
     profiles: tuple[ContourProfile, ...] = ()
     brightest: int | None = None
+    rectified: bool = False
 
 
 @dataclass(frozen=True)
@@ -159,7 +160,7 @@ def scan_statistics(index: int, scan: Scan, closely: bool = True) -> ScanStatist
         sweep = float(np.ptp(np.asarray(scan.offsets_s, np.float64)))
     ground, heights = None, np.zeros(0)
     if closely:
-        on_ground = np.isin(scan.classes, _GROUND)
+        on_ground = _labelled_ground(scan.classes)
         ground = _ground(points[on_ground], points[~on_ground])
         member = (scan.classes == int(SemanticClass.VEHICLE)) & (ranges < 2.0 * median_range)
         instances = None if scan.instances is None else scan.instances[member]
@@ -203,6 +204,7 @@ def image_statistics(index: int, image: CameraImage, closely: bool = True) -> Im
         {c: row / height for c, row in rows.items()},
         contour_profiles(image.mask, image.pixels, SemanticClass.VEHICLE) if closely and shows else (),
         int(image.pixels.max()) if image.has_picture else None,
+        image.stretch is not None,
     )
 
 
@@ -227,6 +229,14 @@ def _places(count: int) -> FloatArray:
 def _counts(classes: NDArray[np.uint8]) -> dict[int, int]:
     counts = np.bincount(classes.ravel(), minlength=1)
     return {int(c): int(counts[c]) for c in np.flatnonzero(counts)}
+
+
+def _labelled_ground(classes: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """(n,) the points labelled ground; where these are few, with terrain, which may be a bank or rocks."""
+    ground = np.asarray(classes == int(SemanticClass.GROUND))
+    if np.count_nonzero(ground) >= _LEAST_POINTS:
+        return ground
+    return np.asarray(ground | (classes == int(SemanticClass.TERRAIN)))
 
 
 def _ground(points: FloatArray, others: FloatArray) -> Ground | None:

@@ -25,7 +25,7 @@ from sst_graph.diagnosis.clocks import stamps, two_clocks
 from sst_graph.diagnosis.hypotheses import best_hypothesis
 from sst_graph.diagnosis.poses import wrong_start
 from sst_graph.diagnosis.units import axes
-from sst_graph.drive.input_statistics import InputStatistics, scan_statistics
+from sst_graph.drive.input_statistics import InputStatistics, image_statistics, scan_statistics
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
@@ -35,7 +35,7 @@ from sst_graph.odometry.sweep import SweepDecision, SweptSource, with_sweep
 from sst_graph.result import FrameId
 from sst_graph.simulator import SimulationConfig
 from sst_graph.sweep_timing import SweepTiming
-from sst_graph.types import NO_PICTURE, Guess, Scan, SemanticClass, Source
+from sst_graph.types import NO_PICTURE, Guess, PixelStretch, Scan, SemanticClass, Source
 from studies.subtle_faults import SUBTLE_FAULTS, SUBTLE_NAMED, repeated_pictures
 from studies.wrong_drives import INPUT_FAULTS, NAMED, shifted_masks
 
@@ -228,6 +228,20 @@ def test_no_vehicle_drives_like_that(speeds: np.ndarray, words: str | None) -> N
         assert found is not None and words in found.evidence and "run too slowly" in found.cause
 
 
+@pytest.mark.parametrize("timeless", [(0,), (3, 4), ()])
+def test_scans_without_times_among_scans_with_times(timeless: tuple[int, ...]) -> None:
+    """Whether they lack the field, or all of its values are 0."""
+    statistics = prepared().statistics
+    assert statistics is not None
+    scans = [replace(scan, sweep_s=0.0 if k in timeless else 0.1) for k, scan in enumerate(statistics.scans)]
+    said = preflight(
+        [replace(prepared(), statistics=replace(statistics, scans=tuple(scans)))], Guess(None, 0.0), ()
+    )
+    found = [finding.evidence for finding in said if "times of their points" in finding.cause]
+    some = "1 of 10 scans have none" if len(timeless) == 1 else "2 of 10 scans have none"
+    assert found == ([f"{some}, or all of them equal"] if timeless else [])
+
+
 def test_single_stamps_that_are_off_are_no_second_clock() -> None:
     """A lost image with the numbering going on, a late frame now and then: the intervals agree otherwise."""
     late = [0, 0, 0, 80, 0, 100, 100, 100, 100, 100]
@@ -363,6 +377,18 @@ def test_it_is_a_remark_unless_it_is_said_how_far_it_may_be_off() -> None:
     (remark,) = reasons()
     assert remark.startswith("the principal point is the middle of the picture")
     assert reasons(cy=8.0) == reasons(estimate=("cx=5",)) == ()
+    # A pinhole to which the pictures of a lens were rectified is centred by its maker, this package.
+    drives = [replace(prepared, statistics=_rectified(prepared.statistics)) for prepared in drives]
+    assert reasons() == ()
+
+
+def _rectified(statistics: InputStatistics | None) -> InputStatistics:
+    """The same of pictures that a lens took."""
+    assert statistics is not None
+    stretch = PixelStretch(np.ones((2, 2, 3), np.float32), 32)
+    images = [frame.image for frame in drive() if frame.image is not None]
+    taken = (image_statistics(k, replace(image, stretch=stretch), False) for k, image in enumerate(images))
+    return replace(statistics, images=tuple(taken))
 
 
 def test_clouds_that_do_not_name_the_laser_of_a_point_are_remarked_on() -> None:

@@ -56,6 +56,14 @@ def test_hills_are_ground() -> None:
     assert ground_points(steep) is None
 
 
+def test_rocks_beside_a_road_are_terrain() -> None:
+    road = ground(0.1, 1.7)
+    road = road[np.abs(road[:, 1]) < 5.0]
+    rocks = np.concatenate([boxes(3.0, 1.7) + np.array([0.0, 5.0 * k, 0.0]) for k in (1, 2, 3)])
+    assert ground_points(drive({SemanticClass.GROUND: road, SemanticClass.TERRAIN: rocks})) is None
+    assert ground_points(drive({SemanticClass.TERRAIN: rocks})) is not None
+
+
 def test_vehicles_are_no_ground() -> None:
     found = ground_points(drive({SemanticClass.GROUND: boxes(1.5, 1.7)}))
     assert found is not None and "class numbers of the points are mixed up" in found.cause

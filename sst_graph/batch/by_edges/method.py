@@ -14,7 +14,13 @@ from sst_graph.batch.by_edges.halves import halves_reasons
 from sst_graph.batch.by_edges.lens import lens_steps
 from sst_graph.batch.by_edges.optimum import RESTARTS, best_optimum_steps, refined_steps, starts_steps
 from sst_graph.batch.by_edges.problem import LabelEstimate, edges_problem, motion_alone
-from sst_graph.batch.by_edges.reasons import EdgeContrast, edge_contrast, edges_reasons, wider_kernel_reasons
+from sst_graph.batch.by_edges.reasons import (
+    EdgeContrast,
+    edge_contrast,
+    edges_reasons,
+    wider_kernel_reasons,
+    with_lens_reasons,
+)
 from sst_graph.batch.by_edges.solution import WIDER_KERNEL_PX
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import MethodEstimate, frames_used
@@ -86,7 +92,7 @@ def edges_method(
         solution.state.time_offsets_s[0],
         covariance,
         frames_used(drives, solution),
-        (*lens_reasons, *reasons, *own.reasons, *sweeps.reasons),
+        (*with_lens_reasons(reasons, lens_reasons, contrast), *own.reasons, *sweeps.reasons),
         remarks,
         by_static_objects=covariance,
         diagnostics=_diagnostics(solution, contrast, motion)

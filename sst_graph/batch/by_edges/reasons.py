@@ -129,6 +129,14 @@ def edges_reasons(
     return (*reasons, *far_reasons(solution.state.cTl, centre.cTl))
 
 
+def with_lens_reasons(
+    reasons: Sequence[str], of_lens: Sequence[str], contrast: EdgeContrast
+) -> tuple[str, ...]:
+    """All reasons, the most important first. Where the pose may be another one altogether, those against the
+    lens are no causes: at a wrong pose some wrong lens always fits better."""
+    return (*reasons, *of_lens) if contrast_reasons(contrast) else (*of_lens, *reasons)
+
+
 def contrast_reasons(contrast: EdgeContrast) -> list[str]:
     """Why a score that stands out so little may be that of a wrong pose."""
     reasons = []
