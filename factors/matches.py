@@ -105,10 +105,12 @@ class Alignment:
         """
         each = self.c_acceleration
         try:
-            return self._some(index, each if each.ndim == 1 else _taken(each, index))
+            if np.ndim(index) == 1:
+                return self._some(index, each if each.ndim == 1 else _taken(each, index))
         except IndexError:
-            expected = f"positions of some of {count_of(len(self), 'match', 'matches')}"
-            raise FactorError("index of take", described(index), expected) from None
+            pass
+        expected = f"positions of some of {count_of(len(self), 'match', 'matches')}"
+        raise FactorError("index of take", described(index), expected)
 
     def of_one_image(self, index: slice | NDArray[np.intp], c_acceleration: FloatArray) -> Alignment:
         """Some of the matches of many images, which belong to one.
@@ -178,15 +180,25 @@ class Alignment:
         return np.asarray(time_offset_s + self.base_taus_s)
 
 
-_OF_EACH_MATCH = ("lPs", "base_taus_s", "pixels", "sigmas_px", "normals", "weights", "l_velocities", "stretches")
+_OF_EACH_MATCH = (
+    "lPs",
+    "base_taus_s",
+    "pixels",
+    "sigmas_px",
+    "normals",
+    "weights",
+    "l_velocities",
+    "stretches",
+)
 """The arrays that have a row for each match."""
 
 
 def _taken(rows: FloatArray, index: slice | NDArray[np.intp]) -> FloatArray:
     """A read-only copy of some rows of (n, ...): a part of an array would keep all of it."""
-    # Integers take rows many times faster than an index does.
-    by_number = isinstance(index, np.ndarray) and index.dtype.kind == "i"
-    taken = rows.take(index, axis=0) if by_number else np.array(rows[index])
+    if isinstance(index, np.ndarray) and index.dtype.kind == "i":
+        taken = rows.take(index, axis=0)  # many times faster than by an index
+    else:
+        taken = np.array(rows[index])
     taken.flags.writeable = False
     return taken
 
