@@ -53,6 +53,7 @@ STREET = SimulationConfig(
     speed_mps=6.0,
 )
 SMALL = ["--frames", "3", "--set", "width=160", "--set", "height=64", "--set", "azimuth_step_deg=2"]
+QUICK = ["--set", "search.enabled=false", "--set", "find_causes=false", "--no-report"]
 TRACK = ["--set", "start_scans=4", "--set", "calibration.search.enabled=false", "--checkpoint-every", "2"]
 ENDED = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129}
 READER_GONE = 141
@@ -191,7 +192,7 @@ class Bench:
         if not self.data.exists():
             self.data.mkdir(parents=True)
             write_drive(simulate(STREET), self.data / "street")
-            self.run([*_calibrate(self.data, self.data)[:-1], str(self.data / "result"), "--no-report"])
+            self.run([*_calibrate(self.data, self.data)[:-1], str(self.data / "result"), *QUICK])
 
     def desk(self) -> Path:
         """An empty folder to write into."""

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from .arguments import FloatArray, checked_array, checked_number, checked_positive, checked_type, described
 from .condensed import condense_gram, condense_root, cost_rows
-from .custom.factor import custom_factor, recipe_of
+from .custom.factor import own_factor, recipe_of
 from .custom.variables import Argument, Variables, Vector, checked_key, is_key, number_or_key, pose_or_key
 from .errors import FactorError, count_of
 from .matches import Alignment, joined_points
@@ -231,7 +231,7 @@ def image_factor(
     rows = residual.variables.cols + 2
     function = _ImageError(residual, True, rows)
     variables = residual.variables
-    return custom_factor(_over_rows(noise, rows), variables.named, function, variables.kinds, rows, name)
+    return own_factor(_over_rows(noise, rows), variables.named, function, variables.kinds, rows, name)
 
 
 def stacked(factor: gtsam.CustomFactor) -> gtsam.CustomFactor:

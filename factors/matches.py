@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -105,10 +105,12 @@ class Alignment:
         """
         each = self.c_acceleration
         try:
-            return self._some(index, each if each.ndim == 1 else _taken(each, index))
+            if np.ndim(index) == 1:
+                return self._some(index, each if each.ndim == 1 else _taken(each, index))
         except IndexError:
-            expected = f"positions of some of {count_of(len(self), 'match', 'matches')}"
-            raise FactorError("index of take", described(index), expected) from None
+            pass
+        expected = f"positions of some of {count_of(len(self), 'match', 'matches')}"
+        raise FactorError("index of take", described(index), expected)
 
     def of_one_image(self, index: slice | NDArray[np.intp], c_acceleration: FloatArray) -> Alignment:
         """Some of the matches of many images, which belong to one.
@@ -116,23 +118,20 @@ class Alignment:
         Args:
             c_acceleration: (6,) of that image's twist [rad/s^2, m/s^2].
         """
-        some = self._some(index, c_acceleration)
-        static = some.l_velocities is not None and not some.l_velocities.any()
-        return replace(some, l_velocities=None) if static else some
+        some = self._some(index, checked_array("c_acceleration of an alignment", c_acceleration, (6,)))
+        if some.l_velocities is not None and not some.l_velocities.any():
+            object.__setattr__(some, "l_velocities", None)
+        return some
 
     def _some(self, index: slice | NDArray[np.intp], c_acceleration: FloatArray) -> Alignment:
-        return replace(
-            self,
-            lPs=_taken(self.lPs, index),
-            base_taus_s=self.base_taus_s[index],
-            pixels=_taken(self.pixels, index),
-            sigmas_px=self.sigmas_px[index],
-            normals=None if self.normals is None else _taken(self.normals, index),
-            weights=self.weights[index],
-            c_acceleration=c_acceleration,
-            l_velocities=None if self.l_velocities is None else _taken(self.l_velocities, index),
-            stretches=None if self.stretches is None else self.stretches[index],
-        )
+        """Of numbers that were checked: to check them again takes longer than all else here."""
+        names = [field.name for field in fields(self)]
+        values = {name: getattr(self, name) for name in names} | {"c_acceleration": c_acceleration}
+        for name in _OF_EACH_MATCH:
+            values[name] = None if values[name] is None else _taken(values[name], index)
+        some = object.__new__(Alignment)
+        vars(some).update(values)
+        return some
 
     @property
     def rows_per_match(self) -> int:
@@ -181,11 +180,27 @@ class Alignment:
         return np.asarray(time_offset_s + self.base_taus_s)
 
 
+_OF_EACH_MATCH = (
+    "lPs",
+    "base_taus_s",
+    "pixels",
+    "sigmas_px",
+    "normals",
+    "weights",
+    "l_velocities",
+    "stretches",
+)
+"""The arrays that have a row for each match."""
+
+
 def _taken(rows: FloatArray, index: slice | NDArray[np.intp]) -> FloatArray:
-    """Some rows of (n, k): integers take them many times faster than an index does."""
+    """A read-only copy of some rows of (n, ...): a part of an array would keep all of it."""
     if isinstance(index, np.ndarray) and index.dtype.kind == "i":
-        return rows.take(index, axis=0)
-    return rows[index]
+        taken = rows.take(index, axis=0)  # many times faster than by an index
+    else:
+        taken = np.array(rows[index])
+    taken.flags.writeable = False
+    return taken
 
 
 def joined_points(alignments: Sequence[Alignment]) -> Sequence[Alignment]:

@@ -20,7 +20,7 @@ from .arguments import (
     checked_positive,
     checked_type,
 )
-from .custom.factor import custom_factor
+from .custom.factor import custom_factor, own_factor
 from .custom.variables import Kind, Vector, checked_key, checked_keys
 from .errors import FactorError
 from .motion import twist_ad
@@ -249,7 +249,7 @@ def twist_transfer_factor(
     keys = {"V_key": V_key, "E_key": E_key, "D_key": D_key}
     kinds: list[Kind] = [Vector(6), gtsam.Pose3, Vector(1)]
     function = partial(_twist_error, lidar_twist)
-    return custom_factor(noise, keys, function, kinds, 6, "twist_transfer_factor")
+    return own_factor(noise, keys, function, kinds, 6, "twist_transfer_factor")
 
 
 def _twist_error(

@@ -154,15 +154,28 @@ def custom_factor(
             kind, a wrong shape, a missing Jacobian, NaN or inf (ISAM2 cannot go on after that: linearize
             first).
     """
-    checked_type("name of a factor", name, str, "a str")
-    named = checked_keys(name, keys)
-    kinds = tuple(dims) if isinstance(dims, list) else dims
-    recipe = FactorRecipe(noise, named, function, kinds, rows, name)  # type: ignore[arg-type]  # checked
-    values = tuple(f"value_{i}" for i in range(len(named)))
+    factor = own_factor(noise, keys, function, dims, rows, name)
+    values = tuple(f"value_{i}" for i in range(len(keys)))
     if (other := other_signature(function, values, ("jacobians",))) is not None:
         expected = f"({', '.join(values)}, *, jacobians)"
         raise FactorError(f"function of {name}", f"one with the arguments {other}", expected)
-    return recipe.build()
+    return factor
+
+
+def own_factor(
+    noise: gtsam.noiseModel.Base,
+    keys: Sequence[int] | Mapping[str, int],
+    function: ResidualFunction,
+    dims: Sequence[Kind],
+    rows: int,
+    name: str,
+) -> gtsam.CustomFactor:
+    """:func:`custom_factor` of a function of this package: its arguments need no look, which takes as long as
+    all other checks."""
+    checked_type("name of a factor", name, str, "a str")
+    named = checked_keys(name, keys)
+    kinds = tuple(dims) if isinstance(dims, list) else dims
+    return FactorRecipe(noise, named, function, kinds, rows, name).build()  # type: ignore[arg-type]  # checked
 
 
 def _returned(name: str, pair: Any) -> tuple[Any, Any]:

@@ -20,7 +20,8 @@ from sst_graph.result import read_result
 from sst_graph.simulator import SimulationConfig, simulate, write_drive
 
 SMALL = ["--frames", "2", "--set", "width=160", "--set", "height=64", "--set", "azimuth_step_deg=2"]
-PARSED = ["--frames", "0:2"]
+PARSED = ["--frames", "0:2", "--set", "search.enabled=false", "--set", "find_causes=false"]
+"""A result of some kind, soon."""
 
 
 @pytest.fixture(scope="module")
@@ -156,8 +157,8 @@ def test_options_of_another_kind_in_a_result_are_refused(
 def test_a_start_of_other_pairs_is_reported(
     street: Path, shifted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    start = str(shifted)
-    command = ["track", str(street), "--init", start, "--set", "calibration.search.enabled=false"]
+    command = ["track", str(street), "--init", str(shifted), "--set", "calibration.search.enabled=false"]
+    command += ["--set", "calibration.decide_sweep=false"]
     assert main(command) == 3
     assert "was made with --image-shift 1, found --image-shift 0" in capsys.readouterr().err
     assert main([*command, "--image-shift", "1"]) == 3

@@ -22,8 +22,8 @@ from stored import written
 from sst_graph.cli import main
 from sst_graph.result import read_result
 
-AT_ONCE = ["--sweep", "compensated"]
-"""Where it does not matter: deciding it takes longer than what is tested."""
+AT_ONCE = ["--set", "calibration.decide_sweep=false"]
+"""Where the sweep does not matter: deciding it takes longer than what is tested."""
 SOON = [word for setting in streets.SOON for word in ("--set", setting)]
 
 
@@ -67,7 +67,7 @@ def test_one_line_a_frame(street: Path, tmp_path: Path, capsys: pytest.CaptureFi
 
 def test_a_parameter_is_estimated(street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "calibration.json"
-    main(["track", str(street), *SOON, "--estimate", "focal=0.01", "--out", str(out)])
+    main(["track", str(street), *SOON, *AT_ONCE, "--estimate", "focal=0.01", "--out", str(out)])
     lines, result = _lines(capsys.readouterr().out), read_result(out)
     assert lines[0]["estimated"] == {} and lines[-1]["estimated"] == result.diagnostics["estimated"]
     focal = lines[-1]["estimated"]["focal"]
@@ -119,7 +119,7 @@ def test_killed_and_resumed(street: Path, tmp_path: Path, capsys: pytest.Capture
 def saved(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A checkpoint after eight frames of the street."""
     path = tmp_path_factory.mktemp("saved") / "tracker.npz"
-    main(["track", str(street), "--frames", "0:8", *SOON, "--checkpoint", str(path)])
+    main(["track", str(street), "--frames", "0:8", *SOON, *AT_ONCE, "--checkpoint", str(path)])
     return path
 
 
@@ -174,7 +174,7 @@ def test_resumed_without_options_or_with_the_same(
     street: Path, saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Settings that are not named are the checkpoint's; those that are, are its own."""
-    for options in ([], [*SOON, "--init", "dataset"]):
+    for options in ([], [*SOON, *AT_ONCE, "--init", "dataset"]):
         copy = tmp_path / "tracker.npz"
         shutil.copy(saved, copy)
         command = ["track", str(street), "--frames", "0:9", "--checkpoint", str(copy), "--resume"]
@@ -245,7 +245,7 @@ def test_where_there_are_labels_auto_stays_as_it_is(
     street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "calibration.json"
-    main(["track", str(street), "--frames", "0:2", "--out", str(out)])
+    main(["track", str(street), *AT_ONCE, "--frames", "0:2", "--out", str(out)])
     assert read_result(out).config["calibration"]["method"] == "auto"
     assert main(["track", str(street), "--method", "paper"]) == 2
     assert "invalid choice" in capsys.readouterr().err

@@ -35,15 +35,8 @@ def test_view_writes_a_file(
 def test_track_writes_one_beside_its_lines(
     street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = [
-        "track",
-        str(street),
-        *FEW,
-        "--set",
-        "start_scans=3",
-        "--set",
-        "calibration.search.enabled=false",
-    ]
+    settings = ("start_scans=3", "calibration.search.enabled=false", "calibration.decide_sweep=false")
+    command = ["track", str(street), *FEW, *(word for one in settings for word in ("--set", one))]
     code = main(command)
     lines = capsys.readouterr().out
     out = tmp_path / "track.rrd"

@@ -109,8 +109,12 @@ def swept(data: KeptDrive) -> Source:
     return SweptSource(data, decision()) if own else data
 
 
-def causes(data: KeptDrive) -> list[str]:
-    drives = prepare_drives([swept(data)], CalibrationConfig())
+NO_SWEEP = CalibrationConfig(decide_sweep=False)
+"""Where it tells nothing: to decide it takes longer than all else."""
+
+
+def causes(data: KeptDrive, config: CalibrationConfig | None = None) -> list[str]:
+    drives = prepare_drives([swept(data)], config or CalibrationConfig())
     return [finding.sentence for finding in preflight(drives, Guess(data.nominal, 0.0), CLASSES)]
 
 
@@ -121,13 +125,15 @@ def test_right_data_are_left_alone() -> None:
 
 @pytest.mark.parametrize("fault", BY_THEMSELVES)
 def test_a_fault_is_named_before_anything_is_solved(fault: str) -> None:
-    found = causes(INPUT_FAULTS[fault](drive(), other()))
+    # The sweep shows in the stamps; clouds in mm are tried for numbers that are far too large.
+    config = CalibrationConfig() if "stamps" in fault or fault == "clouds in mm" else NO_SWEEP
+    found = causes(INPUT_FAULTS[fault](drive(), other()), config)
     assert any(NAMED[fault] in sentence for sentence in found), found
 
 
 @pytest.mark.parametrize("fault", SUBTLE_NAMED)
 def test_frames_that_hold_earlier_ones_are_named(fault: str) -> None:
-    found = causes(SUBTLE_FAULTS[fault](drive()))
+    found = causes(SUBTLE_FAULTS[fault](drive()), NO_SWEEP)
     assert any(SUBTLE_NAMED[fault] in sentence for sentence in found), found
 
 
@@ -294,7 +300,7 @@ def test_checks_that_run_only_where_a_result_is_not_ok(fault: str) -> None:
 
 def test_clouds_in_the_cameras_axes_are_named_with_the_start_that_goes_with_them() -> None:
     """That of a scanner mounted on its side differs from it by a turn about the vertical."""
-    (wrong,) = prepare_drives([INPUT_FAULTS["clouds in camera axes"](drive(), other())], CalibrationConfig())
+    (wrong,) = prepare_drives([INPUT_FAULTS["clouds in camera axes"](drive(), other())], NO_SWEEP)
     side = gtsam.Pose3(gtsam.Rot3.Ry(-np.pi / 2.0), np.zeros(3))
     for start in (None, drive().nominal, gtsam.Pose3()):
         found = axes(wrong, start)

@@ -101,6 +101,25 @@ def test_some_of_the_matches_by_position():
     np.testing.assert_array_equal(one.c_acceleration, np.arange(6.0))
 
 
+@pytest.mark.parametrize("index", [np.array([0, 4]), np.array([[0, 1]]), np.array(0), "first"])
+def test_positions_that_are_none_are_refused(index):
+    with pytest.raises(FactorError, match=r"index of take: .*expected positions of some of 4 matches"):
+        distinct().take(index)
+
+
+def test_some_of_the_matches_are_read_only_and_keep_nothing_of_the_others():
+    whole = distinct(c_acceleration=np.zeros(6))
+    for some in (whole.take(np.array([1, 2])), whole.of_one_image(slice(1, 3), np.ones(6))):
+        for name in ("lPs", "base_taus_s", "pixels", "sigmas_px", "weights", "l_velocities"):
+            rows = getattr(some, name)
+            assert not rows.flags.writeable and rows.base is None
+
+
+def test_the_acceleration_of_one_image_is_checked():
+    with pytest.raises(FactorError, match="c_acceleration of an alignment"):
+        distinct().of_one_image(slice(0, 2), np.full(6, np.nan))
+
+
 def test_the_matches_of_one_image_have_its_acceleration_and_no_velocities_of_zero():
     velocities = np.zeros((4, 3))
     velocities[2, 1] = 1.0

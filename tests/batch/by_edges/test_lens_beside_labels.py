@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from stored import simulated
+from stored import simulated, stored
 from streets import LENS_STREET as STREET
 
 from sst_graph import CalibrationConfig, SemanticClass, calibrate
@@ -53,8 +53,28 @@ def found(own: Drive, beside: Sequence[ParameterTest] | None = None) -> dict[str
     return {each.assumption.name: each for each in lens_beside_labels(problem, state, beside)}
 
 
+def counted(
+    right_px: float, beside: Sequence[ParameterTest] | None = None
+) -> tuple[dict[str, ParameterTest], int]:
+    """What edges say, and how many half-samples were solved for it."""
+    solved: list[int] = []
+
+    def counting(*arguments: object) -> object:
+        solved.append(1)
+        return solution_steps(*arguments)  # type: ignore[arg-type]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(covariance, "solution_steps", counting)
+        return found(drive(right_px), beside), len(solved)
+
+
+def all_half_samples(right_px: float) -> tuple[dict[str, ParameterTest], int]:
+    """:func:`counted` of all half-samples, made once a session."""
+    return stored((STREET, "lens beside labels", right_px), lambda: counted(right_px))
+
+
 def test_the_right_principal_point_is_not_contradicted() -> None:
-    tests = found(drive())
+    tests, _ = all_half_samples(0.0)
     assert set(tests) == {"cx", "cy"}
     assert not any(each.contradicted for each in tests.values())
     assert tests["cx"].sigma < 3.0
@@ -62,34 +82,24 @@ def test_the_right_principal_point_is_not_contradicted() -> None:
 
 @pytest.mark.parametrize("right_px", [8.0, -8.0])
 def test_a_wrong_one_is_found(right_px: float) -> None:
-    cx = found(drive(right_px))["cx"]
+    cx = all_half_samples(right_px)[0]["cx"]
     assert cx.contradicted and cx.value == pytest.approx(right_px, abs=2.5)
 
 
 @pytest.mark.parametrize("right_px", [0.0, 8.0])
-def test_half_samples_that_decide_nothing_are_left_out(
-    right_px: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_half_samples_that_decide_nothing_are_left_out(right_px: float) -> None:
     """The outcome is that of all of them."""
-    solved: list[int] = []
-
-    def counting(*arguments: object) -> object:
-        solved.append(1)
-        return solution_steps(*arguments)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(covariance, "solution_steps", counting)
     labels = tuple(ParameterTest(ASSUMPTIONS[name], 2.0, 4.0, False) for name in ("cx", "cy"))
-    own = drive(right_px)
-    everything = with_further_tests(labels, tuple(found(own).values()), 3.3)
-    whole, solved[:] = len(solved), []
-    some = with_further_tests(labels, tuple(found(own, labels).values()), 3.3)
+    (by_all, whole), (by_some, solved) = all_half_samples(right_px), counted(right_px, labels)
+    everything = with_further_tests(labels, tuple(by_all.values()), 3.3)
+    some = with_further_tests(labels, tuple(by_some.values()), 3.3)
     assert [(each.assumption, each.contradicted) for each in some] == [
         (each.assumption, each.contradicted) for each in everything
     ]
     for one, other in zip(some, everything, strict=True):
         assert one.value == pytest.approx(other.value, abs=0.5 * other.sigma)
     assert any(each.contradicted for each in everything) == (right_px > 0.0)
-    assert whole == SAMPLES and (len(solved) <= 3 if right_px == 0.0 else len(solved) == SAMPLES)
+    assert whole == SAMPLES and (solved <= 3 if right_px == 0.0 else solved == SAMPLES)
 
 
 def test_frames_without_pictures_or_that_cannot_be_read_tell_nothing() -> None:
