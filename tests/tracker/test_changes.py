@@ -31,6 +31,8 @@ from sst_graph.types import Frame, SemanticClass
 
 STEP = 20
 """Frame from which on the calibration has changed."""
+ALONE = 23
+"""Frame from which on one vehicle is all that is known; the tracker takes it for a static one by then."""
 CHECKED = 12
 """Frame from which on the start with the eighth frame has been checked against those that came after it."""
 
@@ -219,12 +221,12 @@ def test_what_one_object_alone_contradicts_is_suspected(street: SimulatedDrive, 
     tracker = _warmed_up(tracker_from_truth(street))
     instance = _largest(frames[STEP + 7], street)
     suspected, kept = [], []
-    for frame in frames[: STEP + 6]:
-        update = tracker.add(_alone(frame, street, instance) if frame.index >= STEP else frame)
+    for frame in frames[: ALONE + 6]:
+        update = tracker.add(_alone(frame, street, instance) if frame.index >= ALONE else frame)
         assert not update.alarm and not (update.suspected_change and update.adopted)
         suspected += [frame.index] if update.suspected_change else []
         kept += [tracker.monitor.changes.reference] if update.suspected_change else []
-    assert suspected and min(suspected) >= STEP
+    assert suspected and min(suspected) >= ALONE
     assert all(before is kept[0] for before in kept)
     assert (
         kept[0] is not None and kept[0].scan <= suspected[0] and kept[0].point is not tracker.estimate.point
@@ -343,8 +345,8 @@ def test_a_suspected_change_that_is_given_up_is_no_confirmation(
     tracker = _warmed_up(_sure_tracker(street))
     tracker.monitor.changes.max_pending = 5
     instance = _largest(frames[STEP + 7], street)
-    for frame in frames[: STEP + 14]:
-        update = tracker.add(_alone(frame, street, instance) if frame.index >= STEP else frame)
+    for frame in frames[: ALONE + 12]:
+        update = tracker.add(_alone(frame, street, instance) if frame.index >= ALONE else frame)
     assert tracker.monitor.changes.confirmation.unreliable and not tracker.monitor.changes.reference
     assert update.status == "unconfirmed"
 

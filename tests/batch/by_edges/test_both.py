@@ -38,7 +38,14 @@ from sst_graph.types import Frame, Guess, SemanticClass
 FloatArray = NDArray[np.float64]
 VEHICLE, OBJECT, IGNORE = SemanticClass.VEHICLE, SemanticClass.OBJECT, SemanticClass.IGNORE
 SMALL = SimulationConfig(
-    seed=504, frames=6, motion="no_stop", azimuth_limit_deg=50.0, width=621, height=188, time_offset_s=0.02
+    seed=504,
+    frames=6,
+    motion="no_stop",
+    azimuth_limit_deg=50.0,
+    width=621,
+    height=188,
+    time_offset_s=0.02,
+    moving_fraction=0.0,
 )
 STREET = SimulationConfig(seed=506, frames=16, motion="no_stop", azimuth_limit_deg=50.0, time_offset_s=0.01)
 AWAY = np.array([0.03, -0.04, 0.03, 0.05, -0.04, 0.06])
