@@ -275,7 +275,7 @@ def _ring_edges(
     push = _extrapolated(beams, i, before, known & mask[before])
     if roofs:
         roof = (slope < 0.0) & _within_object(mask, beams, i)
-        push = np.where(roof, _to_tangent(gap, _ROOF_RADIUS_M), push)
+        push = np.where(roof, _to_tangent(gap), push)
     edge = _along_rays(points, beams, i, push)
     half = 0.5 * (gap + push * (slope_there - slope))
     lPs, outward = edge.copy(), edge.copy()
@@ -287,16 +287,16 @@ def _ring_edges(
     return _Edges(i, lPs, outward, kinds)
 
 
-def _to_tangent(gap: FloatArray, radius_m: float) -> FloatArray:
-    """(n,) mean distance along a ray from its return on a curved surface to where rays just touch it [m].
+def _to_tangent(gap: FloatArray) -> FloatArray:
+    """(n,) mean distance along a ray from its return on a roof to where rays just touch the roof [m].
 
     A return that lies h below the tangent to a surface of radius R is sqrt(2 R h) nearer than the point of
-    contact; h is uniform between nothing and the gap between two rings.
+    contact; h is uniform between nothing and the gap between two rings, and the mean 2/3 of the largest.
 
     Args:
-        gap: (n,) distance of the two rings there [m].
+        gap: (n,) distance of the two rings there, above 0 [m].
     """
-    return np.asarray(2.0 / 3.0 * np.sqrt(2.0 * radius_m * np.maximum(gap, 0.0)))
+    return np.asarray(2.0 / 3.0 * np.sqrt(2.0 * _ROOF_RADIUS_M * gap))
 
 
 def _within_object(mask: NDArray[np.bool_], beams: Beams, index: IntArray) -> NDArray[np.bool_]:
