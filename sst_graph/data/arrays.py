@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,24 @@ def numbered_files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
 def optional_files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
     """As :func:`numbered_files`, of a folder that need not be there."""
     return numbered_files(folder, suffixes) if folder.is_dir() else {}
+
+
+def check_stamped(times: Path, stamps: int, files: Mapping[int, Path], what: str) -> None:
+    """Require a stamp of each file's number.
+
+    Args:
+        stamps: how many there are; the first one is of number 0.
+        files: by their numbers.
+        what: they hold, in the plural.
+
+    Raises:
+        DataError: some have none.
+    """
+    without = [files[k].stem for k in sorted(files) if k >= stamps]
+    if without:
+        which = without[0] if len(without) == 1 else f"{len(without)} {what}, {without[0]} to {without[-1]}"
+        found = f"{count_of(stamps, 'stamp')} for {len(files)} {what}"
+        raise DataError(times, found, f"{max(files) + 1}, one for each number from 0: none for {which}")
 
 
 def read_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -100,9 +100,16 @@ BAD = [
     (emptied("image_2"), r"image_2: found no file that is named"),
     (
         text("times.txt", "0\n0.1\n0.2\n0.3\n"),
-        r"times\.txt: found 4 stamps, expected 5, as there are frames from 0 to 000004",
+        r"times\.txt: found 4 stamps for 5 frames, expected 5, one for each number from 0: none for 000004$",
     ),
-    (text("times.txt", "0\n1\n2\n3\n4\n5\n"), r"times\.txt: found 6 stamps, expected 5"),
+    (
+        text("times.txt", "0\n0.1\n"),
+        r"found 2 stamps for 5 frames, expected 5, .* none for 3 frames, 000002 to 000004$",
+    ),
+    (
+        text("times.txt", "0\n1\n2\n3\n4\n5\n"),
+        r"times\.txt: found 6 stamps for 5 frames, expected 5: the last file's number is 000004$",
+    ),
     (text("times.txt", "0\n0.1\n0.1\n0.3\n0.4\n"), r"times\.txt: found equal stamps 1 and 2"),
     (text("times.txt", "0\n0.1\n0.2\n0.15\n0.4\n"), r"times\.txt: found falling stamps 2 and 3"),
     (edited("calib.txt", "P2", "Q2"), r"calib\.txt: found no line P2"),

@@ -110,7 +110,7 @@ def test_kitti_odometry_with_image_stamps_of_its_own(kitti_drive: Path) -> None:
     plain = open_source(kitti_drive, frames="3:4")
     assert plain[0].image is not None
     (kitti_drive / "times_2.txt").write_text("0.1\n0.2\n")
-    with pytest.raises(DataError, match=r"times_2\.txt: found 2 stamps, expected 5, as there are images"):
+    with pytest.raises(DataError, match=r"times_2\.txt: found 2 stamps for 5 images, expected 5"):
         open_source(kitti_drive)
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from sst_graph.data.arrays import listed, numbered_files, optional_files
+from sst_graph.data.arrays import check_stamped, listed, numbered_files, optional_files
 from sst_graph.errors import ConfigError, DataError, count_of
 
 LAYOUT = (
@@ -167,10 +167,11 @@ def _is_sequence(path: Path) -> bool:
 
 def _check_stamps(times: Path, stamps: int, files: Mapping[int, Path], what: str) -> None:
     """Require a stamp for each number up to the last file's, and no more."""
-    count = max(files) + 1
-    if count != stamps:
-        last = files[max(files)].name
-        raise DataError(times, count_of(stamps, "stamp"), f"{count}, as there are {what} from 0 to {last}")
+    check_stamped(times, stamps, files, what)
+    last = max(files)
+    if stamps > last + 1:
+        found = f"{count_of(stamps, 'stamp')} for {len(files)} {what}"
+        raise DataError(times, found, f"{last + 1}: the last file's number is {files[last].stem}")
 
 
 def _point_times(folder: Path, scans: Mapping[int, Path]) -> dict[int, Path] | None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.data.arrays import listed, numbered_files, optional_files
+from sst_graph.data.arrays import check_stamped, listed, numbered_files, optional_files
 from sst_graph.data.kitti.raw_calib import CAM_TO_CAM, VELO_TO_CAM
 from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.files.reading import FileKind, read_text
@@ -111,10 +111,8 @@ def find_raw_files(drive: Path, camera: int) -> RawFiles:
     scans = numbered_files(cloud / "data", (".bin", ".txt"))
     pictures = numbered_files(images / "data", (".png", ".jpg", ".jpeg"))
     scan_stamps, image_stamps = (read_timestamps(folder / "timestamps.txt") for folder in (cloud, images))
-    for files, stamps, folder in ((scans, scan_stamps, cloud), (pictures, image_stamps, images)):
-        if max(files) >= len(stamps):
-            expected = f"{max(files) + 1} or more: one for {files[max(files)].name}"
-            raise DataError(folder / "timestamps.txt", count_of(len(stamps), "stamp"), expected)
+    check_stamped(cloud / "timestamps.txt", len(scan_stamps), scans, "scans")
+    check_stamped(images / "timestamps.txt", len(image_stamps), pictures, "images")
     return RawFiles(
         scans=scans,
         labels=optional_files(drive / "labels", (".label",)),
