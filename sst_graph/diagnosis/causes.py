@@ -24,7 +24,7 @@ def preflight(drives: Sequence[Drive], guess: Guess, classes: Sequence[SemanticC
     for drive in drives:
         found += [cameras.image_size(drive.camera), clocks.stamps(drive), clocks.two_clocks(drive)]
         found += [clocks.apart(drive, guess.time_offset_s), clocks.point_times(drive)]
-        found.append(repeats.repeats(drive))
+        found += [units.rounding(drive), repeats.repeats(drive)]
         if classes:
             found += [labels.ground_points(drive), labels.mask_rows(drive), units.clouds(drive)]
         else:

@@ -9,6 +9,7 @@ from itertools import combinations, pairwise
 import numpy as np
 
 from sst_graph.diagnosis.finding import Finding
+from sst_graph.diagnosis.units import rounded_share
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import count_of
 
@@ -18,6 +19,9 @@ now and then is left to the robust matching."""
 _SHARED = 0.2
 """Of the points of a scan that the scan before has, too, to the last bit: 0 of a moving HDL-64E, up to 0.06
 of a standing one, whose ranges come in steps; a half of two scans in one cloud."""
+_MOST_ROUNDED = 0.001
+"""Step of rounded coordinates, as a share of the median range, above which points of two scans may be equal
+by chance: 0.00015 of an HDL-64E; at walking pace 0.003, which are 2 cm, are enough for :data:`_SHARED`."""
 _LEAST_SAMPLE = 20
 """Points by which two scans are compared."""
 _MOVED_PX, _MOVED_M = 1.0, 0.05
@@ -77,6 +81,8 @@ def shared_scans(drives: Sequence[Drive]) -> Finding | None:
 def _earlier_points(drive: Drive) -> Finding | None:
     """Clouds that hold the points of the scan before, as they were: several scans laid over each other."""
     assert drive.statistics is not None
+    if rounded_share(drive) > _MOST_ROUNDED:
+        return None
     samples = [scan.sample for scan in drive.statistics.scans]
     shares = [
         len(np.intersect1d(a, b, assume_unique=True)) / len(b)

@@ -26,6 +26,8 @@ _LOG_TRUCKS = 1.1
 _LENGTH_UNITS = {1000.0: "millimetres", 100.0: "centimetres", 1.0 / 0.3048: "feet", 1.0 / 0.0254: "inches"}
 _UPRIGHT = 0.7
 """Cosine between two directions that are the same one, roughly."""
+_COARSE = 0.01
+"""Step of rounded coordinates, as a share of the median range: some 10 cm, which displace outlines."""
 _FARTHEST_START_M = 10.0
 """LiDAR and camera on one vehicle, a truck's length apart [m]."""
 
@@ -69,6 +71,27 @@ def clouds(drive: Drive) -> Finding | None:
         evidence,
         f"multiply the points by {1.0 / factor:.3g}",
     )
+
+
+def rounding(drive: Drive) -> Finding | None:
+    """Clouds whose coordinates were rounded so coarsely that outlines cannot be found in them."""
+    share = rounded_share(drive)
+    if drive.statistics is None or share < _COARSE:
+        return None
+    step = float(np.median([scan.step for scan in drive.statistics.scans if scan.step > 0.0]))
+    given = "whole metres" if abs(step - 1.0) < 1e-3 else f"rounded to steps of {step:.3g} m"
+    return Finding(
+        f"the coordinates of the clouds are {given}",
+        f"{100.0 * share:.2g} % of the points' median distance",
+        "give them as the LiDAR measures them, in float32 or with a step of a centimetre or less",
+    )
+
+
+def rounded_share(drive: Drive) -> float:
+    """The step to which coordinates were rounded, as a share of the median range: free of the unit."""
+    scans = () if drive.statistics is None else drive.statistics.scans
+    shares = [scan.step / scan.median_range for scan in scans if scan.step > 0.0]
+    return float(np.median(shares)) if shares else 0.0
 
 
 def axes(drive: Drive, guess: gtsam.Pose3 | None) -> Finding | None:

@@ -22,7 +22,9 @@ from sst_graph.types import CameraImage, FloatArray, Frame, Scan, SemanticClass
 _SCANS, _IMAGES = 12, 12
 """Scans and images with the expensive statistics (geometry, contours), spread over the drive."""
 _LEAST_POINTS = 200
-"""Labelled points of the ground from which a plane is fitted."""
+"""Labelled points of the ground from which a plane is fitted; points of a scan whose rounding is told."""
+_RESOLUTION = 1e-6
+"""Of a coordinate in float32, as a share of the largest, with what is lost in computing it."""
 _GROUND_TOLERANCE = 0.02
 """Distance from the plane, as a share of the median range of the points, within which a point lies on it."""
 _STEEPEST, _AROUND = 0.3, 8
@@ -67,6 +69,9 @@ class ScanStatistics:
         vehicle_heights: (k,) from the ground to the top of its vehicles.
         sample: (s,) sorted numbers of some points, chosen and numbered by their coordinates: a point that is
             equal to the last bit in two scans is in both samples or in none.
+        step: that its coordinates were rounded to, in the cloud's unit; 0 where it has few points or is not
+            one of the chosen ones.
+        median_range: of its points, in the cloud's unit; 0 of a scan without points.
         lasers: whether the data tell by which laser each point was measured; of a scan without points, too.
     """
 
@@ -78,6 +83,8 @@ class ScanStatistics:
     ground: Ground | None = None
     vehicle_heights: FloatArray = field(default_factory=lambda: np.zeros(0))
     sample: NDArray[np.uint64] = field(default_factory=lambda: np.zeros(0, np.uint64))
+    step: float = 0.0
+    median_range: float = 0.0
     lasers: bool = True
 
     def hash(self) -> str:
@@ -151,15 +158,16 @@ class StatisticsCollector:
 
 
 def scan_statistics(index: int, scan: Scan, closely: bool = True) -> ScanStatistics:
-    """Of a scan; the ground and the vehicles only with ``closely``."""
+    """Of a scan; the ground, the vehicles and the step of the coordinates only with ``closely``."""
     points = np.asarray(scan.points, np.float64)
     ranges = np.linalg.norm(points, axis=1)
     median_range = float(np.median(ranges)) if len(ranges) else 0.0
     sweep = 0.0
     if scan.offsets_s is not None and len(scan.offsets_s):
         sweep = float(np.ptp(np.asarray(scan.offsets_s, np.float64)))
-    ground, heights = None, np.zeros(0)
+    ground, heights, step = None, np.zeros(0), 0.0
     if closely:
+        step = _step(points)
         on_ground = _labelled_ground(scan.classes)
         ground = _ground(points[on_ground], points[~on_ground])
         member = (scan.classes == int(SemanticClass.VEHICLE)) & (ranges < 2.0 * median_range)
@@ -169,7 +177,22 @@ def scan_statistics(index: int, scan: Scan, closely: bool = True) -> ScanStatist
     digest = zlib.crc32(np.ascontiguousarray(scan.points).tobytes())
     sample = _sample(scan.points)
     lasers = scan.rings is not None or not len(points)
-    return ScanStatistics(index, scan.stamp_ns, digest, sweep, labelled, ground, heights, sample, lasers)
+    return ScanStatistics(
+        index, scan.stamp_ns, digest, sweep, labelled, ground, heights, sample, step, median_range, lasers
+    )
+
+
+def _step(points: FloatArray) -> float:
+    """The least distance between two values of a coordinate of the points (n, 3), beyond the resolution of
+    float32: of so many points it is next to nothing, unless the coordinates were rounded."""
+    if len(points) < _LEAST_POINTS:
+        return 0.0
+    steps = []
+    for values in points.T:
+        gaps = np.diff(np.unique(values))
+        gaps = gaps[gaps > _RESOLUTION * float(np.abs(values).max())]
+        steps += [float(gaps.min())] if len(gaps) else []
+    return min(steps, default=0.0)
 
 
 _FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)

@@ -24,6 +24,7 @@ from sst_graph.diagnosis.cameras import image_size, uncalibrated
 from sst_graph.diagnosis.clocks import stamps, two_clocks
 from sst_graph.diagnosis.hypotheses import best_hypothesis
 from sst_graph.diagnosis.poses import wrong_start
+from sst_graph.diagnosis.repeats import repeats
 from sst_graph.diagnosis.units import axes
 from sst_graph.drive.input_statistics import InputStatistics, image_statistics, scan_statistics
 from sst_graph.drive.preparation import Drive
@@ -139,6 +140,51 @@ def test_frames_that_hold_earlier_ones_are_named(fault: str) -> None:
 
 def test_a_doubled_picture_now_and_then_is_left_to_the_robust_matching() -> None:
     assert causes(repeated_pictures(drive(), every=5)) == []
+
+
+@pytest.mark.parametrize(
+    ("step_m", "said"),
+    [
+        (0.07, ()),  # a quarter of the points are equal in two scans by chance
+        (0.25, ("the coordinates of the clouds are rounded to steps of 0.25 m (",)),
+        (1.0, ("the coordinates of the clouds are whole metres (",)),
+        (2.0, ("the coordinates of the clouds are rounded to steps of 2 m (",)),
+    ],
+)
+def test_coarsely_rounded_clouds_are_not_taken_for_scans_laid_over_each_other(
+    step_m: float, said: tuple[str, ...]
+) -> None:
+    def rounded(scan: Scan) -> Scan:
+        return replace(scan, points=(np.round(scan.points / step_m) * step_m).astype(np.float32))
+
+    found = causes(drive().with_scans(rounded), NO_SWEEP)
+    assert len(found) == len(said) and all(map(str.startswith, found, said)), found
+
+
+def test_points_equal_by_chance_of_rounding_are_no_earlier_scan() -> None:
+    """Three scans in one cloud are named in any case; with points of 5 cm the same share tells nothing."""
+    accumulated = SUBTLE_FAULTS["three scans in one cloud"](drive())
+    (one,) = prepare_drives([swept(accumulated)], NO_SWEEP)
+    assert one.statistics is not None and repeats(one) is not None
+    coarse = [replace(s, step=0.006 * s.median_range) for s in one.statistics.scans]
+    assert repeats(replace(one, statistics=replace(one.statistics, scans=tuple(coarse)))) is None
+
+
+@pytest.mark.parametrize("share", [1.0, 0.97])
+def test_labels_of_nothing_but_vehicles_are_named(share: float) -> None:
+    """All points of one class: the scenes may well be the same."""
+
+    def all_vehicle(classes: np.ndarray) -> np.ndarray:
+        few = np.random.default_rng(0).random(classes.shape) < share
+        return np.where(few, np.uint8(SemanticClass.VEHICLE), classes).astype(np.uint8)
+
+    points = drive().with_scans(lambda s: replace(s, classes=all_vehicle(s.classes)))
+    masks = drive().with_images(lambda i: replace(i, mask=all_vehicle(i.mask)))
+    for data, what in ((points, "point"), (masks, "mask's pixel")):
+        found = [
+            s for s in causes(data, NO_SWEEP) if s.startswith(f"nearly every {what} is labelled vehicle")
+        ]
+        assert found and "% of all, " in found[0] and "% ground" in found[0]
 
 
 @pytest.mark.parametrize(
