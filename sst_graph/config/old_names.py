@@ -1,19 +1,11 @@
-"""Settings given by an earlier name: read under the name that they have.
+"""What to say of settings that were given by an earlier name.
 
 Names are dotted as ``--set`` takes them: of ``calibrate``, or of ``track`` and the experiments for their own.
 """
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Iterator, Mapping
-from typing import Any
-
-from sst_graph.config.settings import join, walk_settings
-from sst_graph.config.values import printable, shown
-from sst_graph.errors import ConfigError
-
-_LOG = logging.getLogger(__name__)
+from collections.abc import Collection, Mapping
 
 RENAMED: Mapping[str, str] = {
     "assumptions.sigmas.cx": "assumptions.cx",
@@ -38,7 +30,6 @@ RENAMED: Mapping[str, str] = {
     "joint.graph.match.side_sigma_px": "noise.side_sigma_px",
     "joint.graph.object_bias_sigma_px": "noise.object_bias_sigma_px",
     "joint.graph.time_offset_sigma_s": "noise.time_offset_sigma_s",
-    "lower_edges.use": "lower_edges",
     "motion.start.max_offset_s": "search.time_offset_s",
     "observability.offset_s": "observability.time_offset_s",
     "paper.seed": "seed",
@@ -108,75 +99,20 @@ FIXED: Mapping[str, str] = {
 }
 """Old name, or old table -> the module or package that fixes it; the longest that fits counts."""
 
-CALIBRATION = "calibration."
+_CALIBRATION = "calibration."
 """What the names of ``calibrate``'s settings begin with in other commands; the tables leave it out."""
 
-_MAX_DEPTH = 12
-"""Levels of a table that are searched for old names: more than any name has, fewer than recursion allows."""
+
+def new_name(name: str, known: Collection[str]) -> str:
+    """What a setting of an earlier name is called among those that a command knows; empty for other names."""
+    short = name.removeprefix(_CALIBRATION)
+    new = name.removesuffix(short) + RENAMED.get(short, "")
+    return new if new in known else ""
 
 
-def with_new_names(
-    cls: Any, data: Mapping[str, Any], renamed: Mapping[str, str] = RENAMED
-) -> Mapping[str, Any]:
-    """Nested settings for ``cls`` under the names that they have; each old name is logged as a warning.
-
-    A name that neither ``cls`` nor ``renamed`` has stays: whoever reads it refuses it.
-
-    Raises:
-        ConfigError: a setting that is given under two names.
-    """
-    known = {name for name, _, _ in walk_settings(cls)}
-    given: dict[str, tuple[str, Any]] = {}
-    for name, value in _leaves(data):
-        short = name.removeprefix(CALIBRATION)
-        new = name.removesuffix(short) + renamed.get(short, short)
-        if name in known or new not in known:
-            new = name
-        elif new != name:
-            _LOG.warning("setting '%s' is called '%s': use that name", name, new)
-        other, same = given.setdefault(new, (name, value))
-        if other == name:
-            continue
-        if new in (other, name):
-            raise _found_both(name if new == other else other, new)
-        if same != value:
-            raise ConfigError(
-                f"'{printable(other)}' and '{printable(name)}', both called '{new}': found {shown(same)} and "
-                f"{shown(value)}, expected one value"
-            )
-    if all(new == name for new, (name, _) in given.items()):
-        return data
-    tree: dict[str, Any] = {}
-    for new, (name, value) in given.items():
-        *tables, last = new.split(".")
-        table = tree
-        for level, key in enumerate(tables, 1):
-            table = table.setdefault(key, {})
-            if not isinstance(table, dict):  # a single value is given in the table's place
-                raise _found_both(name, ".".join(tables[:level]))
-        if last in table:
-            raise _found_both(name, new)
-        table[last] = value
-    return tree
-
-
-def _found_both(old: str, new: str) -> ConfigError:
-    return ConfigError(f"'{printable(old)}' and '{printable(new)}': found both, expected the second alone")
-
-
-def fixed_in(name: str, fixed: Mapping[str, str] = FIXED) -> str:
+def fixed_in(name: str) -> str:
     """The module that fixes what an earlier setting set; empty for a name that never was one."""
-    place = name.removeprefix(CALIBRATION)
-    while place and place not in fixed:
+    place = name.removeprefix(_CALIBRATION)
+    while place and place not in FIXED:
         place = place.rpartition(".")[0]
-    return fixed.get(place, "")
-
-
-def _leaves(data: Mapping[str, Any], where: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted name and value of each single setting in a nested table."""
-    for key, value in data.items():
-        name = join(where, str(key))
-        if isinstance(value, Mapping) and value and name.count(".") < _MAX_DEPTH:
-            yield from _leaves(value, name)
-        else:
-            yield name, value
+    return FIXED.get(place, "")

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from sst_graph.config.old_names import fixed_in, with_new_names
+from sst_graph.config.old_names import fixed_in, new_name
 from sst_graph.config.ranges import Range
 from sst_graph.config.settings import join, settings_fields
 from sst_graph.config.values import checked, printable, shown
@@ -24,12 +24,9 @@ def from_dict(cls: type[T], data: Mapping[str, Any], base: T | None = None) -> T
     """A ``cls`` with the values of ``data``; what is not named is as in ``base``, or keeps its default, in
     nested tables too.
 
-    Old names of settings (:mod:`sst_graph.config.old_names`) are accepted with a warning in the log.
-
     Raises:
         ConfigError: an unknown key, a value of a wrong type or out of its range, a missing key.
     """
-    data = with_new_names(cls, data)
     _refuse_unknown(cls, data, cls, "")
     return _built(cls, data, "", base)
 
@@ -66,7 +63,6 @@ def with_overrides(config: T, overrides: Sequence[str]) -> T:
         value = _parsed(name.strip(), text.strip())
         for key in reversed(path):
             value = {key: value}
-        value = with_new_names(cls, value)
         _refuse_unknown(cls, value, cls, "")
         _merge(changes, value)
     return _built(cls, changes, "", config)
@@ -154,9 +150,11 @@ def _first_below(place: str, value: Any) -> str:
 
 
 def _hint(root: Any, name: str) -> str:
-    """The settings of ``root`` that an unknown dotted name may mean, else the names at the top; or what fixes
-    it, where it was a setting and its table has none that is spelled alike.
+    """The settings of ``root`` that an unknown dotted name may mean, else the names at the top; or what a
+    setting of this name is called now, or what fixes it where its table has none that is spelled alike.
     """
+    if new := new_name(name, _all_names(root)):
+        return f"it is called '{new}'"
     near = _nearest(name, _all_names(root)) if len(name) <= 200 else []
     table = name.rpartition(".")[0]
     if fixed_in(name) and not (table and any(known.rpartition(".")[0] == table for known in near)):

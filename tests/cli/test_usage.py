@@ -110,10 +110,3 @@ def test_the_package_offers_its_names_on_demand() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[] True\n"
-
-
-def test_the_old_names_of_options() -> None:
-    parse = build_parser().parse_args
-    assert parse(["simulate", "x", "--delay", "-0.1"]).time_offset == -0.1
-    assert parse(["calibrate", "x", "--delay-per-drive"]).time_offset_per_drive is True
-    assert parse(["calibrate", "x"]).time_offset_per_drive is None

@@ -200,7 +200,7 @@ def test_wrong_values_in_files_are_refused_by_file_and_name(command: str, tmp_pa
         ("calibration.noise.object_bias_sigma_px=0", ""),
         ("calibration.noise.object_bias_sigma_px=1e-9", "found 1e-09, expected 0 or at least 0.001 px"),
         (
-            "calibration.motion.start.max_offset_s=6",
+            "calibration.search.time_offset_s=6",
             "calibration.search.time_offset_s: found 6, expected at least 0 and at most 5 s",
         ),
         ("calibration.lidar_odometry.near_m=100", ""),

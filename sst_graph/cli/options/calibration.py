@@ -27,13 +27,6 @@ def add_calibrate(commands: Commands) -> argparse.ArgumentParser:
     calibrate.add_argument(
         "--time-offset-per-drive", action="store_true", default=None, help="one time offset for each drive"
     )
-    calibrate.add_argument(
-        "--delay-per-drive",
-        dest="time_offset_per_drive",
-        action="store_true",
-        default=None,
-        help=argparse.SUPPRESS,
-    )
     _add_rig(calibrate)
     calibrate.add_argument(
         "--out",

@@ -33,7 +33,6 @@ def add_simulate(commands: Commands) -> argparse.ArgumentParser:
     simulate.add_argument(
         "--time-offset", type=float, metavar="S", help=f"true time offset in seconds, of either sign: {SIGN}"
     )
-    simulate.add_argument("--delay", dest="time_offset", type=float, help=argparse.SUPPRESS)
     motions = "mixed, standing, constant, stop_and_go, no_stop, turning, there_and_back"
     simulate.add_argument("--motion", metavar="NAME", help=motions)
     simulate.add_argument("--label-noise", type=float, metavar="LEVEL", help="0: exact, 1: usual, 2: poor")
