@@ -13,8 +13,8 @@ from typing import Any, TypeVar
 from sst_graph.config.old_names import fixed_in, new_name
 from sst_graph.config.ranges import Range
 from sst_graph.config.settings import join, settings_fields
-from sst_graph.config.values import checked, printable, shown
-from sst_graph.errors import ConfigError, DataError, SstGraphError, count_of
+from sst_graph.config.values import MOST_OF_A_NAME, checked, shown
+from sst_graph.errors import ConfigError, DataError, SstGraphError, count_of, printable
 from sst_graph.files.reading import SETTINGS, read_json, read_toml
 
 T = TypeVar("T")
@@ -86,7 +86,9 @@ def _parsed(name: str, text: str) -> Any:
         return text
     except (ValueError, RecursionError):  # integers of thousands of digits, lists nested thousands deep
         found = f"{shown(text)} of {count_of(len(text), 'character')}"
-        raise ConfigError(f"{printable(name)}: found {found}, expected a value of a few") from None
+        raise ConfigError(
+            f"{printable(name, MOST_OF_A_NAME)}: found {found}, expected a value of a few"
+        ) from None
 
 
 def _merge(changes: dict[str, Any], new: Mapping[str, Any]) -> None:
@@ -131,14 +133,16 @@ def _refuse_unknown(cls: Any, data: Mapping[str, Any], root: Any, where: str) ->
         place = join(where, str(key))
         if key not in hints:
             name = _first_below(place, value)
-            raise ConfigError(f"unknown setting '{printable(name)}'; {_hint(root, name)}")
+            raise ConfigError(f"unknown setting '{printable(name, MOST_OF_A_NAME)}'; {_hint(root, name)}")
         if not isinstance(value, Mapping):
             continue
         if dataclasses.is_dataclass(hints[key]):
             _refuse_unknown(hints[key], value, root, place)
         elif value:
             name = _first_below(place, value)
-            raise ConfigError(f"{place} is a single value: '{printable(name)}' does not exist")
+            raise ConfigError(
+                f"{place} is a single value: '{printable(name, MOST_OF_A_NAME)}' does not exist"
+            )
 
 
 def _first_below(place: str, value: Any) -> str:

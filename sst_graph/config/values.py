@@ -15,7 +15,10 @@ from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
 from sst_graph.config.ranges import Range
-from sst_graph.errors import ConfigError, count_of
+from sst_graph.errors import ConfigError, count_of, printable
+
+MOST_OF_A_NAME = 120
+"""Characters of a name from outside that are shown."""
 
 
 def checked(hint: Any, value: Any, place: str, limits: Range) -> Any:
@@ -135,11 +138,5 @@ def shown(value: Any) -> str:
     return " ".join(_Short().repr(value).split())
 
 
-def printable(name: str) -> str:
-    """A name from outside, on one line and short enough to read."""
-    shown = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in name[:120])
-    return shown if len(name) <= 120 else shown + "..."
-
-
 def mismatch(place: str, value: Any, expected: str) -> ConfigError:
-    return ConfigError(f"{printable(place)}: found {shown(value)}, expected {expected}")
+    return ConfigError(f"{printable(place, MOST_OF_A_NAME)}: found {shown(value)}, expected {expected}")

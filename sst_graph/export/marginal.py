@@ -56,6 +56,9 @@ __all__ = [
     "read_marginal",
 ]
 
+_CONVERGED_SIGMAS, _MOST_ROUNDS = 1e-4, 20
+"""The estimate fused of graphs has converged when a round moves it by less [sigma]; most rounds."""
+
 
 def marginal_of_result(result: CalibrationResult) -> CalibrationMarginal:
     """The marginal of a calibration: its estimate, with the inverse of its cluster-robust covariance.
@@ -188,8 +191,6 @@ def fuse_graphs(
     E_key: int = EXTRINSIC,
     D_key: int = TIME_OFFSET,
     *,
-    tolerance_sigmas: float = 1e-4,
-    max_rounds: int = 20,
     significance: float = SIGNIFICANCE,
 ) -> tuple[CalibrationMarginal, list[CalibrationMarginal]]:
     """Drives fused through their marginals until that equals one graph of all of them.
@@ -202,8 +203,6 @@ def fuse_graphs(
     Args:
         graphs: each drive's own graph and its values; they share nothing but E and D.
         E_key, D_key: keys of extrinsic and time offset, the same in all.
-        tolerance_sigmas: the fused estimate has converged when it moves by less [sigma].
-        max_rounds: most rounds.
         significance: as in :func:`fuse_marginals`. It holds for graphs whose noise models hold: one that
             takes matches which err together for independent contradicts others too easily.
 
@@ -223,15 +222,15 @@ def fuse_graphs(
             raise FactorError("graphs", count_of(len(pair), "object"), expected)
     parts = [marginal_of_graph(graph, values, E_key, D_key) for graph, values in graphs]
     fused = fuse_marginals(parts, significance=significance)
-    for _ in range(max_rounds):
+    for _ in range(_MOST_ROUNDS):
         point = Calibration(fused.cTl, fused.time_offset_s)
         parts = [marginal_of_graph(graph, values, E_key, D_key, at=point) for graph, values in graphs]
         fused = fuse_marginals(parts, significance=significance)
         step = np.append(fused.cTl.localCoordinates(point.cTl), fused.time_offset_s - point.time_offset_s)
-        if np.sqrt(step @ fused.information @ step) < tolerance_sigmas:
+        if np.sqrt(step @ fused.information @ step) < _CONVERGED_SIGMAS:
             return fused, parts
     raise EstimationError(
-        f"fusion of {count_of(len(graphs), 'drive')}: still moving after {count_of(max_rounds, 'round')}"
+        f"fusion of {count_of(len(graphs), 'drive')}: still moving after {_MOST_ROUNDS} rounds"
     )
 
 

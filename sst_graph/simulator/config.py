@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 from sst_graph.config import Settings, setting
+from sst_graph.sweep_timing import SweepStamp
 
 Motion = Literal["mixed", "standing", "constant", "stop_and_go", "no_stop", "turning", "there_and_back"]
 """Ego motion: ``mixed`` stands, accelerates, turns and brakes; ``constant`` goes straight at one speed;
 ``there_and_back`` goes forward for half of the drive and returns in reverse."""
 SweepSense = Literal["clockwise", "counterclockwise"]
 """Which way the scanner turns, seen from above."""
-SweepStamp = Literal["forward", "start", "end"]
-"""Which instant of a turn the scan's stamp names."""
 SweepOutput = Literal["times", "raw", "compensated"]
 """What the data hold of a rolling sweep: the time of each point; the points as measured and no times; the
 points moved to where they lie at the stamp by the true ego motion (moving objects stay as measured)."""

@@ -38,7 +38,6 @@ Progress = Callable[[int, int], None]
 def write_drive(
     drive: SimulatedDrive,
     path: str | Path,
-    overwrite: bool = False,
     progress: Progress | None = None,
     stereo: bool = False,
 ) -> Path:
@@ -52,16 +51,15 @@ def write_drive(
     Args:
         drive: from :func:`simulate`.
         path: folder to be made.
-        overwrite: whether a simulated drive that stands there, its files unchanged, may be replaced.
         progress: called with (frames done, frames in all).
         stereo: write image_3 and semantic_3 as well: the right camera, where calib.txt has it.
 
     Raises:
-        ConfigError: ``path`` is there and may not be replaced.
+        ConfigError: ``path`` is there, and not empty.
         OSError: it cannot be written.
         FactorError: ``progress`` cannot be called so.
     """
-    with atomic_directory(path, overwrite, DRIVE) as root:
+    with atomic_directory(path, False, DRIVE) as root:
         fill_drive(drive, root, progress, stereo)
     return Path(path) / "sequences" / "00"
 
