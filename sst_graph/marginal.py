@@ -191,15 +191,17 @@ class CalibrationMarginal(ByValue):
         """Whether both are linearized at the very same point."""
         return self.time_offset_s == other.time_offset_s and self.cTl.equals(other.cTl, 0.0)
 
-    def to_json(self) -> str:
-        """The marginal as documented in docs/reference/marginal.md, on the keys of this package."""
+    def to_json(self, E_key: int = EXTRINSIC, D_key: int = TIME_OFFSET) -> str:
+        """The marginal as documented in docs/reference/marginal.md.
+
+        Raises:
+            FactorError: no keys, or one for both.
+        """
+        E_key, D_key = marginal_keys(E_key, D_key)
         document = {
             "format": FORMAT,
             "version": VERSION,
-            "variables": [
-                _variable("extrinsic", EXTRINSIC, "Pose3", 6),
-                _variable("offset", TIME_OFFSET, "Vector", 1),
-            ],
+            "variables": [_variable("extrinsic", E_key, "Pose3", 6), _variable("offset", D_key, "Vector", 1)],
             "error": "0.5 d'*information*d - vector'*d + 0.5*constant, "
             "d = [Logmap(T0^-1 * T_camera_lidar), time_offset_s - offset0]",
             "order": _ORDER,
@@ -212,7 +214,7 @@ class CalibrationMarginal(ByValue):
             "information": self.information.tolist(),
             "vector": self.vector.tolist(),
             "constant": self.constant,
-            "gtsam_serialized": self.factor().serialize(),
+            "gtsam_serialized": self.factor(E_key, D_key).serialize(),
         }
         if self.common.scan_hashes:
             document[SCAN_HASHES] = list(self.common.scan_hashes)

@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
+from stored import simulated
 
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.result import CalibrationResult
 from sst_graph.rig import KnownRig, RigMarginal, RigResult
+from sst_graph.simulator import SimulatedDrive, SimulationConfig
+from sst_graph.simulator.rig import beside, stereo_pose, with_mounts
 
 CAMERA = PinholeCamera(700.0, 700.0, 600.0, 180.0, 1242, 375)
 SIGMAS = np.array([0.001, 0.001, 0.001, 0.01, 0.01, 0.01, 0.002])
+
+
+def stereo(street: SimulationConfig) -> Mapping[str, SimulatedDrive]:
+    """A rendered street seen by a stereo rig with one trigger: left and right."""
+    drive = simulated(street)
+    return with_mounts(drive, {"right": beside(drive, stereo_pose())}, "left")
 
 
 def covariance_of(cameras: int, seed: int = 0, scale: float = 1.0) -> NDArray[np.float64]:

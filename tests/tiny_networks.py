@@ -10,6 +10,8 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+from sst_graph.types import Scan, SemanticClass, with_intensities
+
 Node = tuple[str, list[str], list[str], dict[str, Any]]
 
 
@@ -103,3 +105,9 @@ def range_yaml(path: Path, more: str = "", size: tuple[int, int] = (16, 64)) -> 
         f"height: {size[0]}\nmean: [0, 0, 0, 0, 0]\nstd: [1, 1, 1, 1, 1]\n{more}"
     )
     return described
+
+
+def scan_of(points: np.ndarray, intensities: np.ndarray | None = None) -> Scan:
+    """A scan without labels of points (n, 3)."""
+    classes = np.full(len(points), SemanticClass.IGNORE, np.uint8)
+    return with_intensities(Scan(7, points.astype(np.float32), classes), intensities)

@@ -53,7 +53,7 @@ def joint_reasons(
         *_moving(solution),
         *(_little_agreement(problem, covariance, labels) if searched else ()),
         *(_outside_search(problem, solution) if searched else ()),
-        *_alternatives(problem, solution, solutions, covariance),
+        *_alternatives(solution, solutions, covariance),
     )
 
 
@@ -131,10 +131,7 @@ def _outside_search(problem: CalibrationProblem, solution: JointSolution) -> Ite
 
 
 def _alternatives(
-    problem: CalibrationProblem,
-    solution: JointSolution,
-    solutions: Sequence[JointSolution],
-    covariance: FloatArray,
+    solution: JointSolution, solutions: Sequence[JointSolution], covariance: FloatArray
 ) -> Iterator[str]:
     """Solutions elsewhere that agree with the labels almost as well."""
     best, *others = solutions

@@ -211,7 +211,7 @@ def _refine(
     supporters = np.abs(residual) < 4.0 * noise
     variance = noise**2 * _cost_of_weights(residual[supporters] / noise)
     information = J[supporters].T @ J[supporters]
-    spurious = noise**2 * _spurious_information(aRb, direction, fa[supporters], fb[supporters], camera)
+    spurious = noise**2 * _spurious_information(aRb, direction, fa[supporters], camera)
     covariance = variance * _inverse_of_genuine(information, spurious)
     return _Refined(aRb, direction, covariance, supporters, noise)
 
@@ -242,7 +242,7 @@ def _softened(length: FloatArray, camera: PinholeCamera) -> FloatArray:
 
 
 def _spurious_information(
-    aRb: FloatArray, direction: FloatArray, fa: FloatArray, fb: FloatArray, camera: PinholeCamera
+    aRb: FloatArray, direction: FloatArray, fa: FloatArray, camera: PinholeCamera
 ) -> FloatArray:
     """(5, 5) information that one pixel of noise along the epipolar lines seems to bring.
 

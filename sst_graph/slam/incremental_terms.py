@@ -176,7 +176,7 @@ class IncrementalTerms:
             rematched += swapped
             before, estimate = estimate, self._solver.calculateEstimate()
             if alone is not None:
-                first_warnings = wide_uncertainty(self._matches(), before, alone, self._config)
+                first_warnings = wide_uncertainty(self._matches(), before, alone)
                 self._start, alone = (before, alone), None
             covariance, found, converged = self._anneal(estimate)
             if converged:

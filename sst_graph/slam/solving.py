@@ -111,7 +111,7 @@ def solve_with_terms(
     parameters.setMaxIterations(_INNER_ITERATIONS)
     matches = match_all(terms, values, kernel_px, 1.0)
     start, alone = values, marginal(graph, values, keys)[:7, :7]
-    warnings = wide_uncertainty(matches, values, alone, config)
+    warnings = wide_uncertainty(matches, values, alone)
     converged, rounds = False, 0
     while not converged and rounds < config.most_rounds:
         whole = with_factors(graph, matches)

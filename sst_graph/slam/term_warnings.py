@@ -64,7 +64,6 @@ def wide_uncertainty(
     matches: Sequence[TermMatches],
     values: gtsam.Values,
     covariance: FloatArray,
-    config: RematchConfig,
     reach_px: float | None = None,
 ) -> list[TermWarning]:
     """A warning where the calibration may err by more than matches reach.
@@ -73,7 +72,6 @@ def wide_uncertainty(
         matches: of all terms.
         values: the estimate.
         covariance: (7, 7) of extrinsic and offset: at the start by all but these matches, at the end by all.
-        config: the schedule.
         reach_px: limit; by default the search range of the matches [px].
     """
     found = [each for each in matches if each.factor is not None]
@@ -121,7 +119,7 @@ def last_warnings(
     matches: Sequence[TermMatches], values: gtsam.Values, covariance: FloatArray, config: RematchConfig
 ) -> list[TermWarning]:
     """What may be wrong with the last matches at the estimate."""
-    warnings = wide_uncertainty(matches, values, covariance, config, config.last_px)
+    warnings = wide_uncertainty(matches, values, covariance, config.last_px)
     left_ms = 1e3 * max((each.left_interval_s(values) for each in matches), default=0.0)
     if left_ms > 0.0:
         warnings.append(TermWarning(WarningKind.LEFT_INTERVAL, left_ms, 0.0, "ms"))

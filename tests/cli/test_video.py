@@ -12,19 +12,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from videos import read_video
 
 from sst_graph.cli import main
 
 FRAMES = 6
-
-
-def _read(path: Path) -> tuple[list[NDArray[np.uint8]], float]:
-    video = cv2.VideoCapture(str(path))
-    pictures = []
-    while (read := video.read())[0]:
-        pictures.append(np.asarray(read[1], np.uint8))
-    return pictures, video.get(cv2.CAP_PROP_FPS)
 
 
 @pytest.mark.slow
@@ -36,7 +28,7 @@ def test_the_video_has_the_picture_of_each_frame(
     assert main([*command, "--video", str(video)]) == 0
     assert f"{FRAMES} frames" in capsys.readouterr().out
     assert main([*command, "--frame", "3", "--out", str(picture)]) == 0
-    pictures, rate_hz = _read(video)
+    pictures, rate_hz = read_video(video)
     expected = cv2.imread(str(picture))
     assert len(pictures) == FRAMES and rate_hz == pytest.approx(10.0, rel=0.05)
     # The same picture, to what is lost by compression; another frame's is another.
@@ -58,9 +50,9 @@ def test_it_is_whole_or_not_there(
     captured = capsys.readouterr()
     assert captured.err.count("\n") == 1 and scan.name in captured.err
     assert not video.parent.exists()
-    assert main([*command, "0:2"]) == 0 and len(_read(video)[0]) == 2
+    assert main([*command, "0:2"]) == 0 and len(read_video(video)[0]) == 2
     assert main([*command, "0:2"]) == 2 and "--overwrite" in capsys.readouterr().err
-    assert main([*command, "0:3", "--overwrite"]) == 0 and len(_read(video)[0]) == 3
+    assert main([*command, "0:3", "--overwrite"]) == 0 and len(read_video(video)[0]) == 3
 
 
 @pytest.mark.parametrize(
@@ -104,11 +96,11 @@ def test_calibrate_writes_one_into_its_folder_or_beside_it(street: Path, tmp_pat
     ]
     assert main([*command, "--out", str(out), "--video", str(out / "drive.mp4")]) == 3
     names = json.loads((out / ".sst-graph-manifest.json").read_text())
-    assert len(_read(out / "drive.mp4")[0]) == 3 and "drive.mp4" in json.dumps(names)
+    assert len(read_video(out / "drive.mp4")[0]) == 3 and "drive.mp4" in json.dumps(names)
     beside = tmp_path / "drive.gif"
     # What was written inside is replaced with the folder; the video beside it is a file of its own.
     assert main([*command, "--out", str(out), "--overwrite", "--video", str(beside)]) == 3
-    assert len(_read(beside)[0]) == 3 and not (out / "drive.mp4").exists()
+    assert len(read_video(beside)[0]) == 3 and not (out / "drive.mp4").exists()
 
 
 def test_calibrate_refuses_before_it_works(

@@ -9,7 +9,8 @@ from functools import cache
 import gtsam
 import numpy as np
 import pytest
-from stored import simulated, stored
+from rigs import stereo
+from stored import stored
 
 from sst_graph import CalibrationConfig
 from sst_graph.covariance.considered import AssumptionConfig
@@ -23,7 +24,7 @@ from sst_graph.result import CalibrationResult
 from sst_graph.rig import KnownPose, KnownRig, RigResult
 from sst_graph.rig.calibrate import calibrate_rig_prepared, prepare_rig
 from sst_graph.simulator import SimulatedDrive, SimulationConfig
-from sst_graph.simulator.rig import beside, stereo_pose, with_mounts
+from sst_graph.simulator.rig import stereo_pose
 from sst_graph.types import Calibration, Guess
 
 STREET = SimulationConfig(
@@ -50,8 +51,7 @@ NAMES = ("left", "right")
 
 @cache
 def rig() -> Mapping[str, SimulatedDrive]:
-    drive = simulated(STREET)
-    return with_mounts(drive, {"right": beside(drive, stereo_pose())}, "left")
+    return stereo(STREET)
 
 
 @cache

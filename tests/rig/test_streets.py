@@ -9,7 +9,8 @@ from functools import cache
 import gtsam
 import numpy as np
 import pytest
-from stored import simulated, stored
+from rigs import stereo
+from stored import stored
 from streets import CROWDED_STREET as STREET
 
 from sst_graph import CalibrationConfig, calibrate
@@ -30,9 +31,7 @@ NAMES = ("left", "right")
 
 @cache
 def rig() -> Mapping[str, SimulatedDrive]:
-    """A stereo rig with one trigger."""
-    drive = simulated(STREET)
-    return with_mounts(drive, {"right": beside(drive, stereo_pose())}, "left")
+    return stereo(STREET)
 
 
 @cache

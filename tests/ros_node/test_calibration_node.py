@@ -14,16 +14,14 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from stored import written
-from streets import SHORT_STREET, SOON
+from streets import SOON
 
 pytest.importorskip("rosbags")
 
-from bags import CAMERA_FRAME, CLOUD, EPOCH_NS, IMAGE, INFO, LIDAR_FRAME, MASK, Messages, bag_of
+from bags import CAMERA_FRAME, CLOUD, EPOCH_NS, IMAGE, INFO, LIDAR_FRAME, MASK, Messages
 from rosbags.highlevel import AnyReader
 
 from sst_graph.cli import main
-from sst_graph.data import KittiSource, open_source
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.ros_node import CalibrationNode, NodeSettings, Published
 from sst_graph.ros_node.settings import node_settings, parameter_defaults
@@ -41,14 +39,6 @@ def config() -> TrackerConfig:
     from sst_graph.config import with_overrides
 
     return with_overrides(TrackerConfig(), SOON)
-
-
-@pytest.fixture(scope="module")
-def bag(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """The street as a bag: images are received 25 ms after the clouds of the same stamp."""
-    source = open_source(written(SHORT_STREET))
-    assert isinstance(source, KittiSource)
-    return bag_of(source, tmp_path_factory.mktemp("bag") / "mcap")
 
 
 @cache

@@ -19,15 +19,14 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from stored import written
-from streets import SHORT_STREET, SOON
+from streets import SOON
 
 pytest.importorskip("rclpy")
 pytest.importorskip("tf2_msgs.msg")
 pytest.importorskip("rosbags")
 
 import rclpy
-from bags import CAMERA_FRAME, CLOUD, EPOCH_NS, IMAGE, INFO, LIDAR_FRAME, MASK, bag_of
+from bags import CAMERA_FRAME, CLOUD, EPOCH_NS, IMAGE, INFO, LIDAR_FRAME, MASK
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.context import Context
@@ -41,7 +40,6 @@ from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
 from sst_graph.cli import main
-from sst_graph.data import KittiSource, open_source
 from sst_graph.ros_node.topics import message_class
 
 TOPICS = {"image_topic": IMAGE, "info_topic": INFO, "cloud_topic": CLOUD, "mask_topic": MASK}
@@ -51,14 +49,6 @@ pytestmark = pytest.mark.slow
 
 Message = tuple[str, str, int, bytes]
 """Topic, type, time of receipt [ns] and bytes."""
-
-
-@pytest.fixture(scope="module")
-def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The short street with its masks."""
-    source = open_source(written(SHORT_STREET))
-    assert isinstance(source, KittiSource)
-    return bag_of(source, tmp_path_factory.mktemp("bag") / "mcap")
 
 
 @pytest.fixture(scope="module")

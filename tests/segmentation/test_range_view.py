@@ -6,16 +6,11 @@ import math
 
 import numpy as np
 import pytest
+from tiny_networks import scan_of
 
 from sst_graph.segmentation.range_view import Neighbours, RangeImage, RangeView
-from sst_graph.types import Scan, SemanticClass, with_intensities
 
 VIEW = RangeView(32, 8, 10.0, -30.0, (1.0, 2.0, 3.0, 4.0, 0.5), (2.0, 2.0, 2.0, 2.0, 0.25))
-
-
-def scan_of(points: np.ndarray, intensities: np.ndarray | None = None) -> Scan:
-    classes = np.full(len(points), SemanticClass.IGNORE, np.uint8)
-    return with_intensities(Scan(7, points.astype(np.float32), classes), intensities)
 
 
 def test_a_point_lies_where_the_papers_equation_puts_it() -> None:

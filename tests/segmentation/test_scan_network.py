@@ -7,20 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from tiny_networks import range_yaml, write_range_network
+from tiny_networks import range_yaml, scan_of, write_range_network
 
 from sst_graph.classes.data_sets import SEMANTIC_KITTI, SEMANTIC_KITTI_20
 from sst_graph.errors import DataError
 from sst_graph.segmentation import open_scan_segmenter
 from sst_graph.segmentation.range_view import Neighbours, RangeView
 from sst_graph.segmentation.scan_network import OnnxScanSegmenter
-from sst_graph.types import Scan, SemanticClass, with_intensities
-
-
-def scan_of(points: np.ndarray, intensities: np.ndarray | None = None) -> Scan:
-    classes = np.full(len(points), SemanticClass.IGNORE, np.uint8)
-    return with_intensities(Scan(7, points.astype(np.float32), classes), intensities)
-
+from sst_graph.types import SemanticClass
 
 ABOVE_AND_BELOW = scan_of(np.array([[9.0, 0, 0.4], [9.0, 3, 0.3], [9.0, 0, -1.6], [9.0, -4, -1.5]]))
 

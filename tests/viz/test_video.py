@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from videos import read_video
 
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.viz.video import check_video_name, write_video
@@ -24,20 +24,11 @@ def _pictures(count: int, size: tuple[int, int] = SIZE) -> Iterator[NDArray[np.u
         yield picture
 
 
-def _read(path: Path) -> tuple[list[NDArray[np.uint8]], float]:
-    """Pictures of a video, and its rate [Hz]."""
-    video = cv2.VideoCapture(str(path))
-    pictures = []
-    while (read := video.read())[0]:
-        pictures.append(np.asarray(read[1], np.uint8))
-    return pictures, video.get(cv2.CAP_PROP_FPS)
-
-
 @pytest.mark.parametrize("suffix", [".mp4", ".gif"])
 def test_pictures_come_back(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / "any name"
     assert write_video(path, suffix, _pictures(7), 8.0) == 7
-    pictures, rate_hz = _read(path)
+    pictures, rate_hz = read_video(path)
     assert len(pictures) == 7 and rate_hz == pytest.approx(8.0, rel=0.05)
     # H.264 wants an even number of pixels.
     assert pictures[0].shape == ((96, 162, 3) if suffix == ".mp4" else (95, 161, 3))
@@ -60,7 +51,7 @@ def test_pictures_of_another_size_are_fitted_in(tmp_path: Path) -> None:
     write_video(
         path, ".mp4", (one for size in (SIZE, (322, 60), (80, 40)) for one in _pictures(1, size)), 10.0
     )
-    first, wide, small = _read(path)[0]
+    first, wide, small = read_video(path)[0]
     assert first.shape == wide.shape == small.shape
     assert wide[50, 80].max() < 8 and wide[15, 120] == pytest.approx((0, 100, 200), abs=8)
     assert small[20, 120].max() < 8 and small[20, 60] == pytest.approx((0, 100, 200), abs=8)

@@ -123,7 +123,7 @@ def _fields(array: NDArray[Any], path: Path) -> dict[str, NDArray[Any]]:
     if array.dtype.names is not None:
         if array.ndim != 1:
             raise DataError(path, f"records of shape {array.shape}", "(n,)")
-        return structured_fields(path, array)
+        return structured_fields(array)
     if array.ndim != 2 or array.shape[1] not in (3, 4):
         raise DataError(path, f"an array of shape {array.shape}", "(n, 3) or (n, 4), or records with x, y, z")
     return {name: array[:, k] for k, name in enumerate(_COLUMNS[: array.shape[1]])}

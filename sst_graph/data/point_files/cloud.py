@@ -148,7 +148,7 @@ def check_count(path: Path, count: int) -> None:
         raise DataError(path, count_of(count, "point"), f"0 to {MAX_POINTS}")
 
 
-def structured_fields(path: Path, records: NDArray[Any]) -> dict[str, NDArray[Any]]:
+def structured_fields(records: NDArray[Any]) -> dict[str, NDArray[Any]]:
     """Fields (n,) of structured records (n,), in the machine's byte order."""
     return {
         name: np.ascontiguousarray(records[name]).astype(records.dtype[name].newbyteorder("="), copy=False)

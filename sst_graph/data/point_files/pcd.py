@@ -64,7 +64,7 @@ def read_pcd(data: bytes, path: Path) -> Cloud:
         records = _binary(body, header, path)
     else:
         records = _compressed(body, header, path)
-    return cloud_of(path, structured_fields(path, records))
+    return cloud_of(path, structured_fields(records))
 
 
 def _header(data: bytes, path: Path) -> PcdHeader:

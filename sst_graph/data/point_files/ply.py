@@ -54,7 +54,7 @@ def read_ply(data: bytes, path: Path) -> Cloud:
         check_count(path, element.count)
         if element.name == "vertex":
             records = _records(data[at:], encoding, dtype, element.count, path)
-            return cloud_of(path, structured_fields(path, records))
+            return cloud_of(path, structured_fields(records))
         at = _behind(data, at, encoding, dtype.itemsize, element, path)
     raise DataError(path, "no element vertex", "points in x, y, z")
 
