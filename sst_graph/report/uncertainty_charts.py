@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 
 from sst_graph.fit import Fit, Profile
+from sst_graph.inspect.gained_text import SHORT
 from sst_graph.inspect.inspection import HUMAN, NAMES, UNITS, Correlation, correlation_matrix, sigma_ellipse
 from sst_graph.report.chart import Chart
 from sst_graph.report.html import figure, table, text
@@ -15,7 +16,6 @@ from sst_graph.result import CalibrationResult
 
 _LEAST_SIGMAS = 1e-3
 """Distances below are drawn at it: they are nothing beside the uncertainty."""
-_SHORT = ("rot x", "rot y", "rot z", "x", "y", "z", "offset")
 _ELLIPSES = 3
 
 
@@ -107,7 +107,7 @@ def ellipse_charts(result: CalibrationResult, pairs: Sequence[Correlation]) -> l
         chart.line(ellipse[0], ellipse[1], "a", "1 sigma")
         chart.dots([0.0], [0.0], "a")
         caption = f"Correlation {pair.value:+.2f}: in a narrow slanted ellipse the two hardly separate."
-        found.append(figure(chart.svg(), f"{_SHORT[i]} against {_SHORT[j]}", caption))
+        found.append(figure(chart.svg(), f"{SHORT[i]} against {SHORT[j]}", caption))
     return found
 
 
@@ -115,8 +115,8 @@ def correlation_table(result: CalibrationResult) -> str:
     """The seven by seven correlations, strong ones marked."""
     values = correlation_matrix(result.covariance)
     plain = table(
-        ("", *_SHORT),
-        [(name, *(f"{value:+.2f}" for value in row)) for name, row in zip(_SHORT, values, strict=True)],
+        ("", *SHORT),
+        [(name, *(f"{value:+.2f}" for value in row)) for name, row in zip(SHORT, values, strict=True)],
         "numbers",
     )
     for strong in {f"{value:+.2f}" for value in values.flat if 0.6 <= abs(value) < 1.0}:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -72,6 +73,15 @@ def test_a_filter_by_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert "calibrate: 0 settings" in out and "drift.rotation_deg = 0.005" in out and "window" not in out
     assert main(["settings", "nothing.like.it"]) == 2
     assert "no name contains it" in capsys.readouterr().err
+
+
+def test_the_names_of_the_help_are_names_of_settings(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["settings", "--help"])
+    said = re.search(r"such as (\S+) or (\S+)", " ".join(capsys.readouterr().out.split()))
+    assert said is not None
+    for name in said.groups():
+        assert main(["settings", name]) == 0 and f"\n{name}" in capsys.readouterr().out
 
 
 def test_the_page_is_what_the_command_prints(capsys: pytest.CaptureFixture[str]) -> None:

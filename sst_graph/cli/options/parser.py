@@ -21,7 +21,7 @@ def add_settings_command(commands: Commands) -> argparse.ArgumentParser:
         metavar="NAME",
         nargs="?",
         default="",
-        help="only those whose dotted name contains this, such as start or joint.graph",
+        help="only those whose dotted name contains this, such as search or noise.mask",
     )
     form = settings.add_mutually_exclusive_group()
     form.add_argument("--json", action="store_true", help="print JSON")
