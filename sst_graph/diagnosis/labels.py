@@ -10,10 +10,13 @@ from sst_graph.drive.input_statistics import InputStatistics
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import count_of
 from sst_graph.features.mask_shift import MaskShift, mask_shift
+from sst_graph.odometry.lidar import MOVABLE_CLASSES
 from sst_graph.types import SemanticClass
 
+_THINGS = (*MOVABLE_CLASSES, SemanticClass.POLE, SemanticClass.SIGN)
+"""Classes of which no scene consists, as a forest does of vegetation."""
 _NOTHING_ELSE = 0.95
-"""Share of all points or pixels in a class that is aligned: the ground alone takes more than the rest."""
+"""Share of all points or pixels in one of them: the ground alone takes more than the rest."""
 _LEAST_SHIFT_PX = 1.5
 """Contours follow the picture's edges over a pixel or two by themselves [px]."""
 _SIGMAS = 4.0
@@ -28,7 +31,7 @@ _ABOVE = 0.1
 
 
 def searched_classes(drives: Sequence[Drive], classes: Sequence[SemanticClass]) -> Finding | None:
-    """None of the classes to align in any scan, or in any mask; or nothing but one of them."""
+    """None of the classes to align in any scan, or in any mask; or hardly anything but one of them."""
     statistics_of_drives = [drive.statistics for drive in drives if drive.statistics is not None]
     names = " or ".join(c.name.lower() for c in classes)
     for what, labelled in (
@@ -52,7 +55,7 @@ def searched_classes(drives: Sequence[Drive], classes: Sequence[SemanticClass]) 
                 "compare the class numbers of the labels with their table, or name other --classes",
             )
         total = sum(sum(counts.values()) for counts in labelled)
-        for c in classes:
+        for c in (c for c in classes if c in _THINGS):
             share = sum(counts.get(int(c), 0) for counts in labelled) / max(total, 1)
             if share > _NOTHING_ELSE:
                 ground = sum(counts.get(int(SemanticClass.GROUND), 0) for counts in labelled) / total

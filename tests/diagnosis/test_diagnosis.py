@@ -23,6 +23,7 @@ from sst_graph.diagnosis import Fit, other_camera, preflight
 from sst_graph.diagnosis.cameras import image_size, uncalibrated
 from sst_graph.diagnosis.clocks import stamps, two_clocks
 from sst_graph.diagnosis.hypotheses import best_hypothesis
+from sst_graph.diagnosis.labels import searched_classes
 from sst_graph.diagnosis.poses import wrong_start
 from sst_graph.diagnosis.repeats import repeats
 from sst_graph.diagnosis.units import axes
@@ -185,6 +186,14 @@ def test_labels_of_nothing_but_vehicles_are_named(share: float) -> None:
             s for s in causes(data, NO_SWEEP) if s.startswith(f"nearly every {what} is labelled vehicle")
         ]
         assert found and "% of all, " in found[0] and "% ground" in found[0]
+
+
+def test_a_forest_is_all_vegetation() -> None:
+    vegetation = np.uint8(SemanticClass.VEGETATION)
+    forest = drive().with_scans(lambda s: replace(s, classes=np.full_like(s.classes, vegetation)))
+    forest = forest.with_images(lambda i: replace(i, mask=np.full_like(i.mask, vegetation)))
+    (one,) = prepare_drives([swept(forest)], NO_SWEEP)
+    assert searched_classes([one], (SemanticClass.VEGETATION, SemanticClass.VEHICLE)) is None
 
 
 @pytest.mark.parametrize(
