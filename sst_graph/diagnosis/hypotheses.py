@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
+from sst_graph.association.time_pairing import pair_by_time
 from sst_graph.diagnosis.finding import Finding
 from sst_graph.diagnosis.fit import (
     LEAST_CONCENTRATION,
@@ -109,7 +110,16 @@ def _shifts(drive: Drive, guess: Guess) -> Iterator[Hypothesis]:
                 "",
                 "compare the first frames of both sensors, or give --image-shift",
             )
-            yield Hypothesis(finding, drive, Guess(guess.cTl, guess.time_offset_s + shift_s))
+            shifted = Guess(guess.cTl, guess.time_offset_s + shift_s)
+            if met := _that_meet_images(drive, shifted.time_offset_s):
+                yield Hypothesis(finding, replace(drive, scans=met), shifted)
+
+
+def _that_meet_images(drive: Drive, time_offset_s: float) -> tuple[ScanFeatures, ...]:
+    """The scans beside which there is an image at this offset: the search samples the scans that it is given,
+    and two or three that have an image agree somewhere by chance."""
+    pairs = pair_by_time(drive.scan_stamps_ns, drive.image_stamps_ns, time_offset_s, drive.image_period_s)
+    return tuple(drive.scans[pair.scan] for pair in pairs)
 
 
 def mirrored(drive: Drive, guess: Guess, fit: Fitter, given: Fit, sideways: bool) -> Finding | None:

@@ -248,6 +248,26 @@ def prepared() -> Drive:
     return one
 
 
+def test_a_shift_in_time_is_judged_by_scans_that_meet_an_image() -> None:
+    """Of scans from all over the drive two or three would, and so few agree somewhere by chance."""
+    slow = drive().with_scans(lambda s: replace(s, stamp_ns=4 * s.stamp_ns))
+    slow = slow.with_images(lambda i: replace(i, stamp_ns=4 * i.stamp_ns))
+    (given,) = prepare_drives([slow], NO_SWEEP)
+    tried: dict[float, int] = {}
+
+    def fit(changed: Drive, guess: Guess) -> Fit | None:
+        images = np.array(changed.image_stamps_ns) * 1e-9 + guess.time_offset_s
+        apart = [np.abs(images - scan.stamp_ns * 1e-9).min() for scan in changed.scans]
+        if guess.time_offset_s != 0.0:
+            tried[round(guess.time_offset_s, 1)] = len(apart)
+            assert max(apart) <= changed.image_period_s
+        return None
+
+    assert best_hypothesis(given, Guess(None, 0.0), fit, None) is None
+    # 10 scans 0.4 s apart, of which those within a period of an image remain.
+    assert tried == {0.9: 8, -0.9: 8, 1.8: 6, -1.8: 6, 2.7: 4, -2.7: 4}
+
+
 @pytest.mark.parametrize(("turn_s", "reported"), [(0.1, False), (0.2, False), (1.0, True)])
 def test_scans_as_measured_of_a_turn_that_no_scanner_needs(turn_s: float, reported: bool) -> None:
     """Stamps ten times too far apart: what was measured in a tenth of a second seems to take a whole one."""

@@ -208,6 +208,23 @@ def test_the_sweep_of_a_hall(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("speed", "yaw_rate", "count", "fraction", "kind"),
+    [
+        # 22 scans of a vehicle at walking speed: 12 in a row reach 2.7 m.
+        (2.5, 0.0, 22, 0.0, "compensated"),
+        # In a tight turn every second scan is too far from the one before it to be registered.
+        (3.0, 0.95, 24, -1.0, "clockwise"),
+    ],
+)
+def test_the_spacing_of_scans_fits_the_drive(
+    speed: float, yaw_rate: float, count: int, fraction: float, kind: str
+) -> None:
+    found = decide_sweep(_hall(speed, fraction, 180.0, yaw_rate), count)
+    assert found.kind == kind, found.sentence
+
+
+@pytest.mark.slow
 def test_the_start_of_a_fast_turn_is_found() -> None:
     """2 m in a turn: points between a wrong start and the right one are off by as much, and match nothing."""
     found = decide_sweep(_hall(20.0, 1.0, -100.0), 14)

@@ -208,15 +208,11 @@ def decide_sweep(
     for pair in sorted(pairs, key=lambda pair: pair.priority(period_s)):
         if pair.speed_ratio < 1.0 or any(abs(pair.position - k) < _WINDOW_SCANS // 2 for k in used):
             continue
-        positions = _window_positions(pair, count)
-        scans = [(k, scan) for k in positions if (scan := scan_at(k)) is not None]
-        if len(scans) < 3:
-            continue
-        window = Window([scan for _, scan in scans], period_s)
-        if window.travel[0] < _MIN_TRAVEL_M and window.travel[1] < _MIN_TRAVEL_RAD:
+        positions, window = _window_around(pair, scan_at, count, period_s)
+        if window is None or not _travels(window):
             continue
         windows.append(window)
-        used += [k for k, _ in scans]
+        used += positions
         decision = replace(_decide(windows, timing), frames=tuple(sorted(set(used))))
         _LOG.info("sweep: %s", decision.sentence)
         if decision.kind != "undecided" or len(windows) == _MAX_WINDOWS:
@@ -249,14 +245,45 @@ def _pair_motions(scan_at: Callable[[int], Scan | None], count: int) -> list[_Pa
     return found
 
 
-def _window_positions(pair: _PairMotion, count: int) -> list[int]:
-    """Positions of the scans around a pair, so far apart that the vehicle moves from one to the next."""
+def _window_around(
+    pair: _PairMotion, scan_at: Callable[[int], Scan | None], count: int, period_s: float
+) -> tuple[list[int], Window | None]:
+    """The window around a pair and the positions of its scans; None where three scans cannot be had.
+
+    Scans that are too far apart to be registered to one another are taken from closer together; in a drive
+    that is too short for all scans of a window, fewer of them are taken from farther apart.
+    """
+    wanted = _spacing(pair)
+    every = min(wanted, max(1, (count - 1) // (_WINDOW_SCANS - 1)))
+    while True:
+        positions = [k for k in _window_positions(pair, count, every) if scan_at(k) is not None]
+        if len(positions) < 3:
+            return positions, None
+        window = Window([scan for k in positions if (scan := scan_at(k)) is not None], period_s)
+        if window.ok and not _travels(window) and every < wanted:
+            every = wanted
+        elif not window.ok and every > 1:
+            every, wanted = every // 2, every // 2
+        else:
+            return positions, window
+
+
+def _travels(window: Window) -> bool:
+    """Whether the vehicle moves enough from the first scan to the last."""
+    return window.travel[0] >= _MIN_TRAVEL_M or window.travel[1] >= _MIN_TRAVEL_RAD
+
+
+def _spacing(pair: _PairMotion) -> int:
+    """One scan in how many belongs to a window, so that the vehicle moves from one to the next."""
     step = min(
         _STEP_M / max(pair.speed_mps * pair.seconds, 1e-3),
         _STEP_RAD / max(pair.turn_radps * pair.seconds, 1e-3),
     )
-    most = min(_MAX_SKIPPED + 1, max(1, (count - 1) // (_WINDOW_SCANS - 1)))
-    every = int(np.clip(round(step), 1, most))
+    return int(np.clip(round(step), 1, _MAX_SKIPPED + 1))
+
+
+def _window_positions(pair: _PairMotion, count: int, every: int) -> list[int]:
+    """Positions of the scans around a pair."""
     length = (_WINDOW_SCANS - 1) * every
     first = int(np.clip(pair.position - length // 2, 0, max(0, count - 1 - length)))
     return list(range(first, min(count, first + length + 1), every))
