@@ -107,6 +107,7 @@ class SilhouetteMatches:
         objects: (n,) object of each match, within its scan.
         sides: (n,) 0 left, 1 right, 2 top, 3 bottom: which side of the object the match lies on.
         index: (n,) which boundary point each match is.
+        level_px: (n,) of :func:`level_sigmas`.
         seen: how many boundary points fall into the image, matched or not.
     """
 
@@ -114,6 +115,7 @@ class SilhouetteMatches:
     objects: NDArray[np.intp]
     sides: NDArray[np.intp]
     index: NDArray[np.intp]
+    level_px: FloatArray
     seen: int
 
     def __len__(self) -> int:
@@ -235,6 +237,7 @@ class EdgeMatches:
         bounds: (g + 1,) where each group's begin, and the end.
         seen: (g,) how many of a group's points fall into the image, matched or not.
         shares: (m,) share of its full weight that each has: less than 1 of faint edges of pictures.
+        level_px: (m,) of :func:`level_sigmas`.
     """
 
     index: IntArray
@@ -243,6 +246,7 @@ class EdgeMatches:
     bounds: IntArray
     seen: IntArray
     shares: FloatArray
+    level_px: FloatArray
 
 
 @dataclass(frozen=True)
@@ -309,6 +313,7 @@ def match_silhouettes(
             points.objects[found.index[a:b]],
             found.sides[a:b],
             found.index[a:b] - start,
+            found.level_px[a:b],
             int(seen),
         )
         for c, (a, b), start, seen in zip(
@@ -392,7 +397,8 @@ def match_edges(
         length = length / enlarged
     sigmas = match_sigmas(length, cosine[on], config)
     sides = sides_of(paired.points.edges[index], outward[on, 0])
-    weights = side_weights(owners, sides, sigmas, config)
+    level_px = level_sigmas(sides, sigmas, config)
+    weights = side_weights(owners, sides, sigmas, level_px, config)
     shares = np.ones(len(index)) if shares is None else shares[near][on]
     weights = weights * shares
     bounds = np.searchsorted(index, paired.bounds)
@@ -409,7 +415,7 @@ def match_edges(
         l_velocities=None if paired.velocities is None else paired.velocities.take(index, axis=0),
         stretches=enlarged,
     )
-    return EdgeMatches(index, sides, alignment, bounds, seen, shares)
+    return EdgeMatches(index, sides, alignment, bounds, seen, shares, level_px)
 
 
 def _contours_or_gradients(
@@ -526,10 +532,20 @@ def sides_of(edges: NDArray[np.uint8], to_the_right: FloatArray) -> IntArray:
     return np.asarray(SIDE_OF[edges, (to_the_right > 0.0).astype(np.intp)])
 
 
-def side_weights(owners: IntArray, sides: IntArray, sigmas_px: FloatArray, config: MatchConfig) -> FloatArray:
+def level_sigmas(sides: IntArray, sigmas_px: FloatArray, config: MatchConfig) -> FloatArray:
+    """(n,) :func:`sampling_sigmas` of upper and lower edges, whose matches share it [px]: a level edge lies
+    between the same two rings all along. 0 at the sides."""
+    level = (sides == TOP) | (sides == BOTTOM)
+    return np.where(level, sampling_sigmas(sigmas_px, config), 0.0)
+
+
+def side_weights(
+    owners: IntArray, sides: IntArray, sigmas_px: FloatArray, level_px: FloatArray, config: MatchConfig
+) -> FloatArray:
     """(n,) weights under which the mean of a side of an object counts with sigma^2 / n + shared^2 instead of
-    sigma^2 / n."""
-    shared_px = np.where(sides == BOTTOM, LOWER_EDGE_SIGMA_PX, config.side_sigma_px)
+    sigma^2 / n, shared by the mask's error at the side and by :func:`level_sigmas`."""
+    of_mask_px = np.where(sides == BOTTOM, LOWER_EDGE_SIGMA_PX, config.side_sigma_px)
+    shared_px = np.hypot(of_mask_px, level_px)
     numbers = owners * SIDES + sides
     information = np.bincount(numbers, sigmas_px**-2.0)[numbers] if len(numbers) else np.zeros(0)
     return np.asarray(1.0 / (1.0 + information * shared_px**2))

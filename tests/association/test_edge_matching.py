@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sst_graph.association.edge_matching import (
+    TOP,
     MatchConfig,
     ScanWithImage,
     SilhouetteMatches,
@@ -185,9 +186,11 @@ def test_sigmas_and_weights() -> None:
     for group in {(o, s) for o, s in zip(found.objects, found.sides, strict=True)}:
         members = (found.objects == group[0]) & (found.sides == group[1])
         sigmas, weights = found.alignment.sigmas_px[members], found.alignment.weights[members]
-        # The mean of a group claims sigma^2 / n and what the side shares, no less.
+        # The mean of a group claims sigma^2 / n and what the side shares, no less: a level edge lies between
+        # the same two rings all along.
         claimed = 1.0 / (weights / sigmas**2).sum()
-        assert claimed == pytest.approx(1.0 / (sigmas**-2.0).sum() + 0.7**2)
+        sampling = sigmas**2 - 1.2**2 if group[1] == TOP else np.zeros(len(sigmas))
+        assert claimed == pytest.approx(1.0 / (sigmas**-2.0).sum() + 0.7**2 + sampling.mean(), rel=1e-3)
 
 
 def test_classes_without_a_contour_have_no_match() -> None:
