@@ -147,7 +147,7 @@ def _by_matches(robust: RobustCovariance, pairs: list[PairMatches], root: float)
     }
     # Where an edge lies between the rings is the LiDAR's error, whatever the masks of the cameras show.
     scores, none = table.scores, np.zeros(len(sides))
-    level = root * scores.level_steps @ gain
+    level = root * scores.level.steps @ gain
     return influences | {"level": _sorted(np.asarray(scores.sides, np.int64), level, none, none)}
 
 

@@ -37,7 +37,8 @@ def random_table(seed: int, m: int = 40, n: int = 8) -> MatchTable:
     J = rng.normal(0.0, 1.0, (m, n)) * roots[:, None]
     # The top is level; its rings are 1 m apart or so, its heights as the frames put it.
     errors = np.where(sides == TOP, rng.uniform(0.3, 0.9, m), 0.0)
-    level = LevelEdges(errors, rng.normal(0.0, 0.1, 3)[frames], rng.uniform(0.25, 0.35, m))
+    places = rng.normal(0.0, 0.1, (3, 3))[frames] + [0.0, 0.0, 1.5]
+    level = LevelEdges(errors, places, rng.uniform(0.25, 0.35, m))
     return MatchTable(csr_array(J), roots, roots**2, rng.normal(size=m), sides, frames, level)
 
 
@@ -138,7 +139,7 @@ def test_frames_add_up_and_can_be_left_out(seed: int) -> None:
     np.testing.assert_allclose(apart.columns(columns).variance(model), expected, rtol=1e-9)
     assert not apart.independent[[6, 8]].any()
     closed = (one + two + three).without_sides([0, 2])
-    assert closed.sides.tolist() == [1, SIDES] and closed.closed_level.any()
+    assert closed.sides.tolist() == [1, SIDES] and closed.level.closed.any()
     np.testing.assert_allclose(closed.variance(model), expected, rtol=1e-9)
     T = np.random.default_rng(seed).normal(size=(5, 8))
     np.testing.assert_allclose(closed.transformed(T).variance(model), T @ expected @ T.T, rtol=1e-9)
