@@ -107,7 +107,7 @@ class SilhouetteMatches:
         objects: (n,) object of each match, within its scan.
         sides: (n,) 0 left, 1 right, 2 top, 3 bottom: which side of the object the match lies on.
         index: (n,) which boundary point each match is.
-        level_px: (n,) of :func:`level_sigmas`.
+        level_px: (n,) of :func:`level_sigmas`; 0 for objects without a class.
         seen: how many boundary points fall into the image, matched or not.
     """
 
@@ -213,6 +213,12 @@ class PairedEdges:
         return np.repeat(self.motion_rows[1], counts, axis=0)
 
     @cached_property
+    def by_masks(self) -> BoolArray:
+        """(n,) whether each point is matched to a mask's contour, not to the picture's gradients."""
+        found = [isinstance(contour, ContourMap) for contour in self.contours]
+        return np.asarray(self.repeated(found), np.bool_)
+
+    @cached_property
     def spans(self) -> list[tuple[int, int]]:
         """Where each group begins and ends."""
         return list(pairwise(self.bounds.tolist()))
@@ -237,7 +243,8 @@ class EdgeMatches:
         bounds: (g + 1,) where each group's begin, and the end.
         seen: (g,) how many of a group's points fall into the image, matched or not.
         shares: (m,) share of its full weight that each has: less than 1 of faint edges of pictures.
-        level_px: (m,) of :func:`level_sigmas`.
+        level_px: (m,) of :func:`level_sigmas`; 0 for objects without a class, all of whose upper edges are
+            taken to err together.
     """
 
     index: IntArray
@@ -397,7 +404,7 @@ def match_edges(
         length = length / enlarged
     sigmas = match_sigmas(length, cosine[on], config)
     sides = sides_of(paired.points.edges[index], outward[on, 0])
-    level_px = level_sigmas(sides, sigmas, config)
+    level_px = np.where(paired.by_masks[index], level_sigmas(sides, sigmas, config), 0.0)
     weights = side_weights(owners, sides, sigmas, level_px, config)
     shares = np.ones(len(index)) if shares is None else shares[near][on]
     weights = weights * shares
@@ -431,12 +438,9 @@ def _contours_or_gradients(
         The contours, and (n,) the share of its full weight that each has.
     """
     n, biases = len(uvs), paired.repeated(paired.biases_px)
-    by_gradient = paired.repeated([isinstance(each, PictureGradients) for each in paired.contours]).astype(
-        bool
-    )
     distances, shares, valid = np.zeros(n), np.ones(n), np.zeros(n, np.bool_)
     normals, feet = np.tile([1.0, 0.0], (n, 1)), uvs.copy()
-    masked, unmasked = np.flatnonzero(~by_gradient), np.flatnonzero(by_gradient)
+    masked, unmasked = np.flatnonzero(paired.by_masks), np.flatnonzero(~paired.by_masks)
     for index in (masked, unmasked):
         some = paired.take(index) if len(index) < n else paired
         groups = [

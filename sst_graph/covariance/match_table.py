@@ -120,7 +120,7 @@ def match_table(
             roots.append(root)
             residuals.append(r)
             curvatures.append(curvatures_of(matches.alignment.kernel, root, r))
-            level.append(level_edges(pair, c))
+            level.append(LevelEdges.of(matches.alignment, matches.level_px, pair.wTl))
             track = np.array([tracks[pair.drive][pair.pair.scan, c, int(o)] for o in matches.objects])
             sides.append((track * _MOST_DRIVES + pair.drive) * SIDES + matches.sides)
     # What several images show of one scan errs together: its points are the same.
@@ -135,17 +135,6 @@ def match_table(
         np.repeat(frames, [len(pair) for pair in pairs]),
         LevelEdges.joined(level),
     )
-
-
-def level_edges(pair: PairMatches, c: SemanticClass) -> LevelEdges:
-    """Which matches of a class lie on level edges.
-
-    Where the edges of objects without a class lie between the rings is considered as common to all of them
-    (:mod:`sst_graph.batch.by_edges.covariance`).
-    """
-    matches = pair.matches[c]
-    own = np.zeros(len(matches)) if c == SemanticClass.OBJECT else matches.level_px
-    return LevelEdges.of(matches.alignment, own, pair.wTl)
 
 
 _MOST_DRIVES = 64

@@ -10,7 +10,7 @@ import numpy as np
 from sst_graph.association.edge_matching import SIDES, MatchConfig
 from sst_graph.covariance.error_model import SideResiduals
 from sst_graph.covariance.level_edges import LevelEdges
-from sst_graph.covariance.match_table import curvatures_of, level_edges, unweighted
+from sst_graph.covariance.match_table import curvatures_of, unweighted
 from sst_graph.covariance.static_objects import dynamic_matches
 from sst_graph.covariance.sums import ScoreSums
 from sst_graph.drive.twists import camera_twist
@@ -132,8 +132,8 @@ def linearize_pair(
     track = np.concatenate([columns.tracks_of(pair, c) for c in pair.matches])
     side = track * SIDES + np.concatenate([m.sides for m in pair.matches.values()])
     own = roots / np.sqrt(share)
-    level = LevelEdges.joined([level_edges(pair, c) for c in pair.matches])
-    scores = ScoreSums.of_frame(J, roots, side, level)
+    level = [LevelEdges.of(each.alignment, each.level_px, pair.wTl) for each in pair.matches.values()]
+    scores = ScoreSums.of_frame(J, roots, side, LevelEdges.joined(level))
     return LinearizedPair(
         information,
         observed,
