@@ -405,7 +405,7 @@ def match_edges(
     sigmas = match_sigmas(length, cosine[on], config)
     sides = sides_of(paired.points.edges[index], outward[on, 0])
     level_px = np.where(paired.by_masks[index], level_sigmas(sides, sigmas, config), 0.0)
-    weights = side_weights(owners, sides, sigmas, level_px, config)
+    weights = side_weights(owners, sides, sigmas, config, (level_px, paired.points.rings[index]))
     shares = np.ones(len(index)) if shares is None else shares[near][on]
     weights = weights * shares
     bounds = np.searchsorted(index, paired.bounds)
@@ -544,12 +544,28 @@ def level_sigmas(sides: IntArray, sigmas_px: FloatArray, config: MatchConfig) ->
 
 
 def side_weights(
-    owners: IntArray, sides: IntArray, sigmas_px: FloatArray, level_px: FloatArray, config: MatchConfig
+    owners: IntArray,
+    sides: IntArray,
+    sigmas_px: FloatArray,
+    config: MatchConfig,
+    level: tuple[FloatArray, IntArray] | None = None,
 ) -> FloatArray:
     """(n,) weights under which the mean of a side of an object counts with sigma^2 / n + shared^2 instead of
-    sigma^2 / n, shared by the mask's error at the side and by :func:`level_sigmas`."""
-    of_mask_px = np.where(sides == BOTTOM, LOWER_EDGE_SIGMA_PX, config.side_sigma_px)
-    shared_px = np.hypot(of_mask_px, level_px)
+    sigma^2 / n, shared the mask's error at that side.
+
+    Args:
+        level: :func:`level_sigmas` and rings (n,): what a ring shows of a side shares that error, too.
+    """
+    shared_px = np.where(sides == BOTTOM, LOWER_EDGE_SIGMA_PX, config.side_sigma_px)
     numbers = owners * SIDES + sides
-    information = np.bincount(numbers, sigmas_px**-2.0)[numbers] if len(numbers) else np.zeros(0)
-    return np.asarray(1.0 / (1.0 + information * shared_px**2))
+    shared = _information(numbers, sigmas_px) * shared_px**2
+    if level is not None:
+        level_px, rings = level
+        count = int(rings.max(initial=0)) + 1
+        shared += _information(numbers * count + rings, sigmas_px) * level_px**2
+    return np.asarray(1.0 / (1.0 + shared))
+
+
+def _information(groups: IntArray, sigmas_px: FloatArray) -> FloatArray:
+    """(n,) of the mean of all matches of each one's group [1/px^2]."""
+    return np.asarray(np.bincount(groups, sigmas_px**-2.0)[groups] if len(groups) else np.zeros(0), np.float64)

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from sst_graph.association.edge_matching import (
     GATE,
     faces,
-    level_sigmas,
     match_sigmas,
     of_matched_objects,
     side_weights,
@@ -188,8 +187,7 @@ class PoseBatch:
         sigma = match_sigmas(length[on], cosine[on], config)
         sides = sides_of(self.edges.points.edges[close.point], way[0, on])
         robust = kernel.weight(r / sigma)
-        level_px = level_sigmas(sides, sigma, config)
-        weight = robust * side_weights(owner, sides, sigma, level_px, config) / sigma**2
+        weight = robust * side_weights(owner, sides, sigma, config) / sigma**2
         # 3. Normal equations.
         rows = self._rows(close, normals[:, on], poses.biases.shape[1])
         motion = self._motion(poses, pairing, close.pose, close.point)
