@@ -107,6 +107,7 @@ class SilhouetteMatches:
         objects: (n,) object of each match, within its scan.
         sides: (n,) 0 left, 1 right, 2 top, 3 bottom: which side of the object the match lies on.
         index: (n,) which boundary point each match is.
+        level_px: (n,) of :func:`level_sigmas`; 0 for objects without a class.
         seen: how many boundary points fall into the image, matched or not.
     """
 
@@ -114,6 +115,7 @@ class SilhouetteMatches:
     objects: NDArray[np.intp]
     sides: NDArray[np.intp]
     index: NDArray[np.intp]
+    level_px: FloatArray
     seen: int
 
     def __len__(self) -> int:
@@ -211,6 +213,12 @@ class PairedEdges:
         return np.repeat(self.motion_rows[1], counts, axis=0)
 
     @cached_property
+    def by_masks(self) -> BoolArray:
+        """(n,) whether each point is matched to a mask's contour, not to the picture's gradients."""
+        found = [isinstance(contour, ContourMap) for contour in self.contours]
+        return np.asarray(self.repeated(found), np.bool_)
+
+    @cached_property
     def spans(self) -> list[tuple[int, int]]:
         """Where each group begins and ends."""
         return list(pairwise(self.bounds.tolist()))
@@ -235,6 +243,8 @@ class EdgeMatches:
         bounds: (g + 1,) where each group's begin, and the end.
         seen: (g,) how many of a group's points fall into the image, matched or not.
         shares: (m,) share of its full weight that each has: less than 1 of faint edges of pictures.
+        level_px: (m,) of :func:`level_sigmas`; 0 for objects without a class, all of whose upper edges are
+            taken to err together.
     """
 
     index: IntArray
@@ -243,6 +253,7 @@ class EdgeMatches:
     bounds: IntArray
     seen: IntArray
     shares: FloatArray
+    level_px: FloatArray
 
 
 @dataclass(frozen=True)
@@ -309,6 +320,7 @@ def match_silhouettes(
             points.objects[found.index[a:b]],
             found.sides[a:b],
             found.index[a:b] - start,
+            found.level_px[a:b],
             int(seen),
         )
         for c, (a, b), start, seen in zip(
@@ -392,7 +404,8 @@ def match_edges(
         length = length / enlarged
     sigmas = match_sigmas(length, cosine[on], config)
     sides = sides_of(paired.points.edges[index], outward[on, 0])
-    weights = side_weights(owners, sides, sigmas, config)
+    level_px = np.where(paired.by_masks[index], level_sigmas(sides, sigmas, config), 0.0)
+    weights = side_weights(owners, sides, sigmas, config, (level_px, paired.points.rings[index]))
     shares = np.ones(len(index)) if shares is None else shares[near][on]
     weights = weights * shares
     bounds = np.searchsorted(index, paired.bounds)
@@ -409,7 +422,7 @@ def match_edges(
         l_velocities=None if paired.velocities is None else paired.velocities.take(index, axis=0),
         stretches=enlarged,
     )
-    return EdgeMatches(index, sides, alignment, bounds, seen, shares)
+    return EdgeMatches(index, sides, alignment, bounds, seen, shares, level_px)
 
 
 def _contours_or_gradients(
@@ -425,12 +438,9 @@ def _contours_or_gradients(
         The contours, and (n,) the share of its full weight that each has.
     """
     n, biases = len(uvs), paired.repeated(paired.biases_px)
-    by_gradient = paired.repeated([isinstance(each, PictureGradients) for each in paired.contours]).astype(
-        bool
-    )
     distances, shares, valid = np.zeros(n), np.ones(n), np.zeros(n, np.bool_)
     normals, feet = np.tile([1.0, 0.0], (n, 1)), uvs.copy()
-    masked, unmasked = np.flatnonzero(~by_gradient), np.flatnonzero(by_gradient)
+    masked, unmasked = np.flatnonzero(paired.by_masks), np.flatnonzero(~paired.by_masks)
     for index in (masked, unmasked):
         some = paired.take(index) if len(index) < n else paired
         groups = [
@@ -526,10 +536,38 @@ def sides_of(edges: NDArray[np.uint8], to_the_right: FloatArray) -> IntArray:
     return np.asarray(SIDE_OF[edges, (to_the_right > 0.0).astype(np.intp)])
 
 
-def side_weights(owners: IntArray, sides: IntArray, sigmas_px: FloatArray, config: MatchConfig) -> FloatArray:
+def level_sigmas(sides: IntArray, sigmas_px: FloatArray, config: MatchConfig) -> FloatArray:
+    """(n,) :func:`sampling_sigmas` of upper and lower edges, whose matches share it [px]: a level edge lies
+    between the same two rings all along. 0 at the sides."""
+    level = (sides == TOP) | (sides == BOTTOM)
+    return np.where(level, sampling_sigmas(sigmas_px, config), 0.0)
+
+
+def side_weights(
+    owners: IntArray,
+    sides: IntArray,
+    sigmas_px: FloatArray,
+    config: MatchConfig,
+    level: tuple[FloatArray, IntArray] | None = None,
+) -> FloatArray:
     """(n,) weights under which the mean of a side of an object counts with sigma^2 / n + shared^2 instead of
-    sigma^2 / n."""
+    sigma^2 / n, shared the mask's error at that side.
+
+    Args:
+        level: :func:`level_sigmas` and rings (n,): what a ring shows of a side shares that error, too.
+    """
     shared_px = np.where(sides == BOTTOM, LOWER_EDGE_SIGMA_PX, config.side_sigma_px)
     numbers = owners * SIDES + sides
-    information = np.bincount(numbers, sigmas_px**-2.0)[numbers] if len(numbers) else np.zeros(0)
-    return np.asarray(1.0 / (1.0 + information * shared_px**2))
+    shared = _information(numbers, sigmas_px) * shared_px**2
+    if level is not None:
+        level_px, rings = level
+        count = int(rings.max(initial=0)) + 1
+        shared += _information(numbers * count + rings, sigmas_px) * level_px**2
+    return np.asarray(1.0 / (1.0 + shared))
+
+
+def _information(groups: IntArray, sigmas_px: FloatArray) -> FloatArray:
+    """(n,) of the mean of all matches of each one's group [1/px^2]."""
+    if len(groups) == 0:
+        return np.zeros(0)
+    return np.asarray(np.bincount(groups, sigmas_px**-2.0)[groups], np.float64)

@@ -14,6 +14,7 @@ from scipy.sparse import csr_array
 from sst_graph.association.edge_matching import SIDES
 from sst_graph.covariance.error_model import SideResiduals
 from sst_graph.covariance.jackknife import curvature_ratio
+from sst_graph.covariance.level_edges import LevelEdges
 from sst_graph.covariance.sums import ScoreSums
 from sst_graph.factors.alignment import weighted_residuals
 from sst_graph.factors.robust import RobustKernel
@@ -38,6 +39,7 @@ class MatchTable:
         r: (m,) whitened residuals, unweighted.
         sides: (m,) number of the object's side, the same in all frames; ``sides // SIDES`` is its object.
         frames: (m,) number of the frame.
+        level: which of them lie on level edges.
     """
 
     J: csr_array
@@ -46,6 +48,7 @@ class MatchTable:
     r: FloatArray
     sides: IntArray
     frames: IntArray
+    level: LevelEdges
 
     @cached_property
     def objects(self) -> IntArray:
@@ -66,7 +69,9 @@ class MatchTable:
     def take(self, index: IntArray) -> MatchTable:
         """Some of the matches, by position."""
         names = ("J", "root_weights", "curvatures", "r", "sides", "frames")
-        return MatchTable(*(getattr(self, name)[index] for name in names))
+        return MatchTable(
+            **{name: getattr(self, name)[index] for name in names}, level=self.level.take(index)
+        )
 
     def after(self, step: FloatArray) -> MatchTable:
         """The matches after a step (n,) of the unknowns, their robust weights as they are."""
@@ -76,7 +81,7 @@ class MatchTable:
     @cached_property
     def scores(self) -> ScoreSums:
         """The sums of their scores."""
-        return ScoreSums.of(self.J, self.root_weights, self.sides, self.frames)
+        return ScoreSums.of(self.J, self.root_weights, self.sides, self.frames, self.level)
 
     @property
     def residuals(self) -> SideResiduals:
@@ -107,7 +112,7 @@ def match_table(
     state = state_from(values, state, pairs)
     steps = {name: value - made_at.get(name, 0.0) for name, value in state.nuisances.items()}
     unknowns, motion = eliminated.unknowns, _Motion(values, eliminated.twist_responses(), steps)
-    blocks, roots, residuals, curvatures, sides = [], [], [], [], []
+    blocks, roots, residuals, curvatures, sides, level = [], [], [], [], [], []
     for pair in pairs:
         for c, matches in pair.matches.items():
             block, root, r = _rows(pair, c, state, unknowns, motion)
@@ -115,6 +120,7 @@ def match_table(
             roots.append(root)
             residuals.append(r)
             curvatures.append(curvatures_of(matches.alignment.kernel, root, r))
+            level.append(LevelEdges.of(matches.alignment, matches.level_px, pair.wTl))
             track = np.array([tracks[pair.drive][pair.pair.scan, c, int(o)] for o in matches.objects])
             sides.append((track * _MOST_DRIVES + pair.drive) * SIDES + matches.sides)
     # What several images show of one scan errs together: its points are the same.
@@ -127,6 +133,7 @@ def match_table(
         np.concatenate(residuals),
         np.concatenate(sides),
         np.repeat(frames, [len(pair) for pair in pairs]),
+        LevelEdges.joined(level),
     )
 
 

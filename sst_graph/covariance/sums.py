@@ -4,10 +4,11 @@ With a match's whitened Jacobian row J, robust weight w and a = sqrt(w) J, an er
 the gradient by its score, sqrt(w) a e. Under the error model (:mod:`sst_graph.covariance.error_model`) the
 gradient of all matches varies by
 
-    M = match * sum a a' + side_frame * sum s_kf s_kf' + side * sum s_k s_k',
+    M = match * sum a a' + side_frame * sum s_kf s_kf' + side * sum s_k s_k' + L,
 
-s_kf the sum of sqrt(w) a over the matches of side k in frame f, and s_k that over all frames. With H the
-information of the whole problem and A = sum a a' the part of it that the matches claim, the covariance is
+s_kf the sum of sqrt(w) a over the matches of side k in frame f, s_k that over all frames, and L by what stays
+of the errors of level edges (:mod:`sst_graph.covariance.level_edges`). With H the information of the whole
+problem and A = sum a a' the part of it that the matches claim, the covariance is
 
     H^-1 + H^-1 (M - A) H^-1.
 
@@ -18,12 +19,13 @@ of the user's own adds term by term.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import csr_array
 
 from sst_graph.covariance.error_model import ErrorModel, by_side_and_frame
+from sst_graph.covariance.level_edges import MOMENTS, LevelEdges, LevelSums
 from sst_graph.graph.linear import scattered
 from sst_graph.types import FloatArray, IntArray
 
@@ -39,6 +41,7 @@ class ScoreSums:
             no frame will see them again.
         sides: (k,) numbers of the other sides, rising.
         scores: (k, n) sum of sqrt(w) a of each of them.
+        level: of the errors of level edges, by the same sides.
     """
 
     independent: FloatArray
@@ -46,28 +49,50 @@ class ScoreSums:
     closed: FloatArray
     sides: IntArray
     scores: FloatArray
+    level: LevelSums
 
     @classmethod
     def none(cls, n: int) -> ScoreSums:
         """Of no match."""
-        nothing = np.zeros((n, n))
-        return cls(nothing, nothing, nothing, np.zeros(0, np.intp), np.zeros((0, n)))
+        nothing, level = np.zeros((n, n)), LevelSums.of_open(np.zeros((0, n)))
+        return cls(nothing, nothing, nothing, np.zeros(0, np.intp), np.zeros((0, n)), level)
 
     @classmethod
-    def of(cls, J: FloatArray | csr_array, roots: FloatArray, sides: IntArray, frames: IntArray) -> ScoreSums:
-        """Of matches, from rows a (m, n), roots of the weights, sides and numbers of the frames (m,)."""
+    def of(
+        cls,
+        J: FloatArray | csr_array,
+        roots: FloatArray,
+        sides: IntArray,
+        frames: IntArray,
+        level: LevelEdges | None = None,
+    ) -> ScoreSums:
+        """Of matches, from rows a (m, n), roots of the weights, sides and numbers of the frames (m,).
+
+        Args:
+            level: which of them lie on level edges; None: none does.
+        """
         first, which = by_side_and_frame(sides, frames)
         by_frame = _members(which, len(first), roots) @ J
         names, side = np.unique(sides[first], return_inverse=True)
-        by_side = _members(side.reshape(-1), len(names), np.ones(len(first))) @ by_frame
-        scores = by_side if isinstance(by_side, np.ndarray) else by_side.toarray()
-        return cls(gram(J), gram(by_frame), np.zeros((J.shape[1],) * 2), names, np.asarray(scores))
+        sides_of = _members(side.reshape(-1), len(names), np.ones(len(first)))
+        scores, errors = _dense(sides_of @ by_frame), LevelSums.of_open(np.zeros((len(names), J.shape[1])))
+        if level is not None:
+            by_edge = _dense(sides_of @ (_members(which, len(first), roots * level.errors) @ J))
+            errors = LevelSums.of_open(by_edge, sides_of @ level.moments(roots**2, which, len(first)))
+        return cls(gram(J), gram(by_frame), np.zeros((J.shape[1],) * 2), names, scores, errors)
 
     @classmethod
-    def of_frame(cls, J: FloatArray, roots: FloatArray, sides: IntArray) -> ScoreSums:
+    def of_frame(
+        cls, J: FloatArray, roots: FloatArray, sides: IntArray, level: LevelEdges | None = None
+    ) -> ScoreSums:
         """Of the matches of one frame, from dense rows."""
         names, scores = summed_rows(J * roots[:, None], sides)
-        return cls(J.T @ J, scores.T @ scores, np.zeros((J.shape[1],) * 2), names, scores)
+        errors = LevelSums.of_open(np.zeros_like(scores))
+        if level is not None:
+            _, by_edge = summed_rows(J * (roots * level.errors)[:, None], sides)
+            moments = level.moments(roots**2, np.searchsorted(names, sides), len(names))
+            errors = LevelSums.of_open(by_edge, moments)
+        return cls(J.T @ J, scores.T @ scores, np.zeros((J.shape[1],) * 2), names, scores, errors)
 
     def __add__(self, other: ScoreSums) -> ScoreSums:
         """These matches and others, of other frames."""
@@ -76,25 +101,26 @@ class ScoreSums:
 
     def __sub__(self, other: ScoreSums) -> ScoreSums:
         """These matches without those of some of the frames, none of whose sides is closed."""
-        scores = self.scores.copy()
-        scores[np.searchsorted(self.sides, other.sides)] -= other.scores
+        scores, places = self.scores.copy(), np.searchsorted(self.sides, other.sides)
+        scores[places] -= other.scores
         independent, side_frames = self.independent - other.independent, self.side_frames - other.side_frames
-        return ScoreSums(independent, side_frames, self.closed, self.sides, scores)
+        level = self.level.without(other.level, places)
+        return ScoreSums(independent, side_frames, self.closed, self.sides, scores, level)
 
     def columns(self, some: IntArray | slice) -> ScoreSums:
         """In some of the unknowns, the others known."""
         A, B, C = (M[some][:, some] for M in (self.independent, self.side_frames, self.closed))
-        return ScoreSums(A, B, C, self.sides, self.scores[:, some])
+        return ScoreSums(A, B, C, self.sides, self.scores[:, some], self.level.columns(some))
 
     def transformed(self, T: FloatArray) -> ScoreSums:
         """In other unknowns, whose score is T (m, n) times that of these."""
         A, B, C = (T @ M @ T.T for M in (self.independent, self.side_frames, self.closed))
-        return ScoreSums(A, B, C, self.sides, self.scores @ T.T)
+        return ScoreSums(A, B, C, self.sides, self.scores @ T.T, self.level.transformed(T))
 
     def scaled(self, weight: float) -> ScoreSums:
         """With the weights of all matches multiplied: the scores by as much, their variance by its square."""
         A, B, C = (weight**2 * M for M in (self.independent, self.side_frames, self.closed))
-        return ScoreSums(A, B, C, self.sides, weight * self.scores)
+        return ScoreSums(A, B, C, self.sides, weight * self.scores, self.level.scaled(weight))
 
     def without_sides(self, gone: Collection[int]) -> ScoreSums:
         """With some sides closed: no frame will see them again."""
@@ -102,14 +128,20 @@ class ScoreSums:
             return self
         leaving = np.isin(self.sides, list(gone))
         rows, kept = self.scores[leaving], ~leaving
-        closed = self.closed + rows.T @ rows
-        return ScoreSums(self.independent, self.side_frames, closed, self.sides[kept], self.scores[kept])
+        closed, level = self.closed + rows.T @ rows, self.level.closing(leaving)
+        sides, scores = self.sides[kept], self.scores[kept]
+        return ScoreSums(self.independent, self.side_frames, closed, sides, scores, level)
+
+    @property
+    def rows(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """What is summed by side."""
+        return self.scores, self.level.scores, self.level.moments
 
     def variance(self, model: ErrorModel) -> FloatArray:
         """(n, n) of the score of all matches, M above."""
         by_side = self.closed + self.scores.T @ self.scores
         whole = model.match * self.independent + model.side_frame * self.side_frames + model.side * by_side
-        return np.asarray(whole)
+        return np.asarray(whole + self.level.variance())
 
     def excess(self, model: ErrorModel) -> FloatArray:
         """(n, n) variance of the score beyond that of independent matches, M - A."""
@@ -121,17 +153,25 @@ def total(n: int, parts: Sequence[ScoreSums], columns: Sequence[IntArray]) -> Sc
     independent, side_frames = scattered(
         n, columns, [part.independent for part in parts], [part.side_frames for part in parts]
     )
-    closed = np.zeros((n, n))
+    closed, level = np.zeros((n, n)), LevelSums.of_open(np.zeros((0, n)))
     for part, own in zip(parts, columns, strict=True):
         if part.closed.any():
             closed[np.ix_(own, own)] += part.closed
+            level = level.with_closed(part.level, own)
     sides = [np.zeros(0, np.intp), *(part.sides for part in parts)]
-    rows = np.zeros((sum(len(own) for own in sides), n))
+    rows = np.zeros((sum(len(own) for own in sides), 2 * n + MOMENTS))
     start = 0
     for part, own in zip(parts, columns, strict=True):
-        rows[start : start + len(part.sides), own] = part.scores
+        some = slice(start, start + len(part.sides))
+        rows[some, own], rows[some, n + own], rows[some, 2 * n :] = part.rows
         start += len(part.sides)
-    return ScoreSums(independent, side_frames, closed, *summed_rows(rows, np.concatenate(sides)))
+    names, rows = summed_rows(rows, np.concatenate(sides))
+    level = replace(level, scores=rows[:, n : 2 * n], moments=rows[:, 2 * n :])
+    return ScoreSums(independent, side_frames, closed, names, rows[:, :n], level)
+
+
+def _dense(rows: FloatArray | csr_array) -> FloatArray:
+    return np.asarray(rows if isinstance(rows, np.ndarray) else rows.toarray())
 
 
 def _members(groups: IntArray, count: int, weights: FloatArray) -> csr_array:

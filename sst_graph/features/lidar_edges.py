@@ -68,7 +68,7 @@ class Boundaries:
         lPs: (m, 3) points in the LiDAR frame [m].
         outward: (m, 3) a point farther out across the edge at the same range [m]: its direction in the
             image tells on which side the background lies.
-        half_gaps_m: (m,) half the gap between the two beams at the object's range [m].
+        rings: (m,) number of the ring that each point's return is from, within the scan.
         offsets_s: (m,) time of each point relative to the scan's stamp [s].
         edges: (m,) of :class:`Edge`.
         objects: (m,) number of the object within the scan.
@@ -76,7 +76,7 @@ class Boundaries:
 
     lPs: FloatArray
     outward: FloatArray
-    half_gaps_m: FloatArray
+    rings: IntArray
     offsets_s: FloatArray
     edges: NDArray[np.uint8]
     objects: IntArray
@@ -94,7 +94,7 @@ class Boundaries:
         return Boundaries(
             self.lPs.take(index, axis=0),
             self.outward.take(index, axis=0),
-            self.half_gaps_m[index],
+            self.rings[index],
             self.offsets_s[index],
             self.edges[index],
             self.objects[index],
@@ -151,7 +151,7 @@ def find_boundaries(
         ]
         if with_lower_edges and c != SemanticClass.OBJECT:
             parts.append(_ring_edges(points, seen, beams, _ground_heights(points, objects)))
-        found[c] = _collect(parts, offsets, objects, max_range_m)
+        found[c] = _collect(parts, beams.ring, offsets, objects, max_range_m)
     return {c: b for c, b in found.items() if len(b)}
 
 
@@ -343,17 +343,15 @@ def _is_behind(rho: FloatArray, last: IntArray, following: IntArray, behind_m: f
 
 
 def _collect(
-    parts: Sequence[_Edges], offsets: FloatArray, objects: IntArray, max_range_m: float
+    parts: Sequence[_Edges], rings: IntArray, offsets: FloatArray, objects: IntArray, max_range_m: float
 ) -> Boundaries:
     index = np.concatenate([part.index for part in parts])
     lPs = np.concatenate([part.lPs for part in parts])
     outward = np.concatenate([part.outward for part in parts])
     edges = np.concatenate([part.kinds for part in parts])
     keep = (objects[index] >= 0) & (np.linalg.norm(lPs, axis=1) < max_range_m)
-    half_gaps = 0.5 * np.linalg.norm(outward - lPs, axis=1)
-    return Boundaries(
-        lPs[keep], outward[keep], half_gaps[keep], offsets[index][keep], edges[keep], objects[index][keep]
-    )
+    index = index[keep]
+    return Boundaries(lPs[keep], outward[keep], rings[index], offsets[index], edges[keep], objects[index])
 
 
 def split_objects(

@@ -44,7 +44,7 @@ from sst_graph.objects.dynamic_objects import (
     dynamic_object_weights,
     find_dynamic_objects,
 )
-from sst_graph.objects.tracks import ObjectId, numbers_in, of_each, tracks_of_scans
+from sst_graph.objects.tracks import ObjectId, numbers_in, of_each, scan_poses, tracks_of_scans
 from sst_graph.types import FloatArray, IntArray, SemanticClass
 
 DynamicObjects = dict[tuple[SemanticClass, int], DynamicObject]
@@ -118,6 +118,7 @@ class PairMatches:
             share their class's mask bias.
         scene: what assumptions may depend on.
         terms: for each class, derivative (n,) of each residual by the parameters that are estimated, by name.
+        wTl: pose of the LiDAR in the world, where it is known.
     """
 
     drive: int
@@ -128,6 +129,7 @@ class PairMatches:
     tracks: Mapping[SemanticClass, NDArray[np.intp]] = field(default_factory=dict)
     scene: Scene | None = None
     terms: Mapping[SemanticClass, Mapping[str, FloatArray]] = field(default_factory=dict)
+    wTl: gtsam.Pose3 | None = None
 
     def __len__(self) -> int:
         return sum(len(matches) for matches in self.matches.values())
@@ -143,7 +145,8 @@ class PairMatches:
 
 
 class Tracks:
-    """Twists of the LiDAR over time in all drives, and tracks of their objects where those are given."""
+    """Twists and poses of the LiDAR over time in all drives, and tracks of their objects where those are
+    given."""
 
     def __init__(
         self,
@@ -151,27 +154,33 @@ class Tracks:
         objects: Sequence[Mapping[ObjectId, int]] | None = None,
         growing: GrowingTwists | None = None,
     ) -> None:
-        """growing: of a single drive whose motions grow."""
+        """growing: of a single drive whose motions grow; its poses are not known."""
         # Smoothed, exactly zero at standstill; None for a single scan.
         self._twists: list[SensorTwists | None] = [
             (growing or GrowingTwists()).of(drive.lidar_motions) for drive in drives
         ]
+        self._poses: list[Sequence[gtsam.Pose3]] = [] if growing else [scan_poses(d) for d in drives]
         self.objects: Sequence[Mapping[ObjectId, int]] | None = objects
         found = zip(drives, objects, strict=True) if objects is not None else ()
         self._dynamic = [_by_scan(find_dynamic_objects(drive, tracks)) for drive, tracks in found]
 
     def with_objects(
-        self, objects: Mapping[ObjectId, int], dynamic: Mapping[ObjectId, DynamicObject]
+        self,
+        objects: Mapping[ObjectId, int],
+        dynamic: Mapping[ObjectId, DynamicObject],
+        poses: Sequence[gtsam.Pose3] = (),
     ) -> Tracks:
-        """The same twists of one drive, with other object tracks and dynamic objects."""
+        """The same twists of one drive, with other object tracks, dynamic objects, and poses of its scans."""
         other = Tracks([])
         other._twists, other.objects, other._dynamic = self._twists, [objects], [_by_scan(dynamic)]
+        other._poses = [poses]
         return other
 
     def part(self, drive: int, scans: Sequence[int]) -> Tracks:
         """The tracks of some scans of one drive (:meth:`Drive.part`), which becomes drive 0."""
         other, place = Tracks([]), {position: k for k, position in enumerate(scans)}
         other._twists = [self._twists[drive]]
+        other._poses = [[self._poses[drive][k] for k in scans]]
         if self.objects is not None:
             other.objects = [tracks_of_scans(self.objects[drive], scans)]
             moving = self._dynamic[drive]
@@ -183,6 +192,7 @@ class Tracks:
         """The tracks of several drives, each given by itself."""
         other = cls([])
         other._twists = [twists for part in parts for twists in part._twists]
+        other._poses = [poses for part in parts for poses in part._poses]
         if all(part.objects is not None for part in parts):
             other.objects = [own for part in parts for own in part.objects or ()]
             other._dynamic = [own for part in parts for own in part._dynamic]
@@ -191,6 +201,11 @@ class Tracks:
     def dynamic_objects(self, drive: int, scan: int) -> DynamicObjects:
         """The dynamic objects of a scan."""
         return self._dynamic[drive].get(scan, {}) if self._dynamic else {}
+
+    def pose(self, drive: int, scan: int) -> gtsam.Pose3 | None:
+        """Pose of a scan in the world, by its position; None where it is not known."""
+        poses = self._poses[drive] if self._poses else ()
+        return poses[scan] if scan < len(poses) else None
 
     def at(self, drive: int, stamp_ns: int) -> TwistSample | None:
         """The LiDAR's twist at a stamp of its clock, or None without odometry."""
@@ -594,6 +609,7 @@ class DriveMatches:
                     objects[self.points[own]],
                     self.found.sides[own],
                     self.places[own],
+                    self.found.level_px[own],
                     seen,
                 )
                 for c, (own, seen) in groups.items()
@@ -605,6 +621,7 @@ class DriveMatches:
                 for c, (own, _) in groups.items()
                 if self.terms
             },
+            self.edges.tracks.pose(self.number, self.pairs[p].scan),
         )
 
     def _alignment_of(self, own: slice, motion: CameraTwist) -> Alignment:

@@ -1,9 +1,10 @@
 """How each error that an estimate depends on moves it: its influence, a step of extrinsic and time offset.
 
 The covariance of one camera's estimate (:mod:`sst_graph.covariance.sums`) is a sum over errors: of a side of
-an object, of a side in one scan, of a boundary point, of the LiDAR's motion at a scan, of a sample of
-objects (jackknife), of an assumption. With H the information and s the score of an error, its influence is
-H^-1 s. Cameras on one LiDAR have such errors in common, which are found here by their names.
+an object, of a side in one scan, of a boundary point, of a level edge between its rings, of the LiDAR's
+motion at a scan, of a sample of objects (jackknife), of an assumption. With H the information and s the score
+of an error, its influence is H^-1 s. Cameras on one LiDAR have such errors in common, which are found here by
+their names.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ IntArray = NDArray[np.int64]
 UNKNOWNS = 7
 """Of one camera: extrinsic and time offset."""
 
-KINDS = ("side", "side_frame", "match")
-"""Kinds of errors of the matches, as the error model has them."""
+KINDS = ("side", "side_frame", "match", "level")
+"""Kinds of errors of the matches, as the error model has them, and of level edges between their rings."""
 
 _MOST_SCANS, _MOST_CLASSES, _MOST_POINTS = 1_000_000, 256, 1_000_000
 
@@ -140,10 +141,14 @@ def _by_matches(robust: RobustCovariance, pairs: list[PairMatches], root: float)
         ),
         "match": (points, model.match, by_match, table.r - frame_mean[which], weights),
     }
-    return {
+    influences = {
         kind: _sorted(np.asarray(names, np.int64), root * np.sqrt(variance) * steps, means, own)
         for kind, (names, variance, steps, means, own) in found.items()
     }
+    # Where an edge lies between the rings is the LiDAR's error, whatever the masks of the cameras show.
+    scores, none = table.scores, np.zeros(len(sides))
+    level = root * scores.level.steps @ gain
+    return influences | {"level": _sorted(np.asarray(scores.sides, np.int64), level, none, none)}
 
 
 def _sorted(names: IntArray, steps: FloatArray, means: FloatArray, weights: FloatArray) -> Influence:

@@ -18,9 +18,10 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sst_graph.association.edge_matching import MatchConfig
+from sst_graph.association.edge_matching import MatchConfig, level_sigmas
 from sst_graph.batch.by_edges.positions import position_columns
 from sst_graph.config import Settings, expect_settings, setting
+from sst_graph.covariance.level_edges import LevelEdges
 from sst_graph.drive.preparation import ImageFeatures, ScanFeatures
 from sst_graph.errors import DataError, count_of
 from sst_graph.factors.arguments import checked_array, checked_positive, checked_type
@@ -106,6 +107,7 @@ class TermRows:
         weights: (m,) robust weight times the match's own.
         sigmas_px: (m,) that the factor gives the residuals [px].
         sides: (m,) number of the side of an object that each match lies on, the same in every image.
+        level: which of them lie on level edges; errors in pixels.
     """
 
     J: FloatArray
@@ -113,16 +115,19 @@ class TermRows:
     weights: FloatArray
     sigmas_px: FloatArray
     sides: NDArray[np.intp]
+    level: LevelEdges
 
     @classmethod
     def none(cls) -> TermRows:
-        return cls(np.zeros((0, COLUMNS)), np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.intp))
+        none, numbers = np.zeros(0), np.zeros(0, dtype=np.intp)
+        return cls(np.zeros((0, COLUMNS)), none, none, none, numbers, LevelEdges.none(0))
 
     @classmethod
     def joined(cls, parts: Sequence[TermRows]) -> TermRows:
         """One after the other."""
-        columns = zip(*(vars(part).values() for part in (cls.none(), *parts)), strict=True)
-        return cls(*(np.concatenate(column) for column in columns))
+        every, names = (cls.none(), *parts), ("J", "r", "weights", "sigmas_px", "sides")
+        columns = {name: np.concatenate([getattr(part, name) for part in every]) for name in names}
+        return cls(**columns, level=LevelEdges.joined([part.level for part in every]))
 
     def __len__(self) -> int:
         return len(self.r)
@@ -347,7 +352,10 @@ class AlignmentTerm:
             if c == SemanticClass.OBJECT:
                 beams = position_columns(of_object, alignment.sigmas_px, self.config.match)
                 columns[:, POSITIONS] = beams[:, :2]
-            parts.append(TermRows(columns, r, weights, alignment.sigmas_px, numbers))
+            own = level_sigmas(of_object, alignment.sigmas_px, self.config.match)
+            level_px = own if c != SemanticClass.OBJECT else np.zeros(len(own))
+            level = replace(LevelEdges.of(alignment, level_px, wTl), errors=level_px)
+            parts.append(TermRows(columns, r, weights, alignment.sigmas_px, numbers, level))
         return TermRows.joined(parts)
 
     def _wTl(self, values: gtsam.Values, X: int) -> gtsam.Pose3:

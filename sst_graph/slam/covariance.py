@@ -178,7 +178,7 @@ class TermSums:
         """Of one term."""
         roots = np.sqrt(rows.weights) / rows.sigmas_px
         J = rows.J * roots[:, None]
-        scores = ScoreSums.of_frame(J, roots, rows.sides)
+        scores = ScoreSums.of_frame(J, roots, rows.sides, rows.level)
         gradient = np.asarray(information * (J.T @ (roots * rows.r)))
         edges = J[rows.J[:, bias_column(SemanticClass.OBJECT)] > 0.0]
         by_edges = information * (edges.T @ edges)

@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 
 from sst_graph.association.edge_matching import (
+    TOP,
     MatchConfig,
     ScanWithImage,
     SilhouetteMatches,
+    level_sigmas,
     match_silhouettes,
     of_matched_objects,
+    side_weights,
 )
 from sst_graph.factors import PinholeCamera, RobustKernel, residuals
 from sst_graph.factors.motion import CameraTwist
@@ -40,7 +43,7 @@ def ring(n: int = 90) -> Boundaries:
     return Boundaries(
         np.array([lTc.transformFrom(p) for p in rim]),
         np.array([lTc.transformFrom(p) for p in out]),
-        np.full(n, 0.03),
+        np.full(n, 5),
         np.zeros(n),
         np.where(top, Edge.TOP, Edge.SIDE).astype(np.uint8),
         np.repeat([0, 1], [n // 2, n - n // 2]),
@@ -185,9 +188,24 @@ def test_sigmas_and_weights() -> None:
     for group in {(o, s) for o, s in zip(found.objects, found.sides, strict=True)}:
         members = (found.objects == group[0]) & (found.sides == group[1])
         sigmas, weights = found.alignment.sigmas_px[members], found.alignment.weights[members]
-        # The mean of a group claims sigma^2 / n and what the side shares, no less.
+        # The mean of a group claims sigma^2 / n and what the side shares, no less: a level edge lies between
+        # the same two rings all along.
         claimed = 1.0 / (weights / sigmas**2).sum()
-        assert claimed == pytest.approx(1.0 / (sigmas**-2.0).sum() + 0.7**2)
+        sampling = sigmas**2 - 1.2**2 if group[1] == TOP else np.zeros(len(sigmas))
+        assert claimed == pytest.approx(1.0 / (sigmas**-2.0).sum() + 0.7**2 + sampling.mean(), rel=1e-3)
+
+
+def test_what_different_rings_show_of_an_edge_errs_apart() -> None:
+    """The mean of 12 matches of one ring, and of three each of four rings."""
+    owners, sides, sigmas = np.zeros(12, np.intp), np.full(12, TOP), np.full(12, 2.0)
+    config = MatchConfig(mask_sigma_px=1.0, side_sigma_px=0.7)
+    level = level_sigmas(sides, sigmas, config)
+    np.testing.assert_allclose(level, np.sqrt(3.0))
+    for rings, apart in ((np.full(12, 7), 1), (np.repeat([7, 8, 9, 10], 3), 4)):
+        weights = side_weights(owners, sides, sigmas, config, (level, rings))
+        claimed = 1.0 / (weights / sigmas**2).sum()
+        assert claimed == pytest.approx(4.0 / 12.0 + 0.7**2 + 3.0 / apart)
+    assert level_sigmas(np.array([0, 1]), sigmas[:2], config).tolist() == [0.0, 0.0]
 
 
 def test_classes_without_a_contour_have_no_match() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from sst_graph.association.edge_matching import SIDES
+from sst_graph.association.edge_matching import SIDES, TOP
 from sst_graph.covariance.cluster_robust import steps_without_objects
 from sst_graph.covariance.error_model import (
     ErrorModel,
@@ -18,6 +18,7 @@ from sst_graph.covariance.error_model import (
     spread_beyond,
     with_floors,
 )
+from sst_graph.covariance.level_edges import LevelEdges, shares_that_stay
 from sst_graph.covariance.match_table import MatchTable
 from sst_graph.covariance.sums import ScoreSums, gram, total
 from sst_graph.graph.elimination import Unknowns, marginal_covariance
@@ -34,7 +35,11 @@ def random_table(seed: int, m: int = 40, n: int = 8) -> MatchTable:
     frames = rng.integers(0, 3, m)
     roots = rng.uniform(0.1, 1.0, m)
     J = rng.normal(0.0, 1.0, (m, n)) * roots[:, None]
-    return MatchTable(csr_array(J), roots, roots**2, rng.normal(size=m), sides, frames)
+    # The top is level; its rings are 1 m apart or so, its heights as the frames put it.
+    errors = np.where(sides == TOP, rng.uniform(0.3, 0.9, m), 0.0)
+    places = rng.normal(0.0, 0.1, (3, 3))[frames] + [0.0, 0.0, 1.5]
+    level = LevelEdges(errors, places, rng.uniform(0.25, 0.35, m))
+    return MatchTable(csr_array(J), roots, roots**2, rng.normal(size=m), sides, frames, level)
 
 
 def drawn_table(model: ErrorModel, seed: int) -> MatchTable:
@@ -53,7 +58,8 @@ def drawn_table(model: ErrorModel, seed: int) -> MatchTable:
         + rng.normal(0.0, np.sqrt(model.match), len(frames))
     )
     names, ones = sides // 3 * SIDES + sides % 3, np.ones(len(r))
-    return MatchTable(csr_array((len(r), 8)), ones, ones, r, names, frames % 6)
+    level = LevelEdges.none(len(r))
+    return MatchTable(csr_array((len(r), 8)), ones, ones, r, names, frames % 6, level)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -77,6 +83,14 @@ def brute_force(table: MatchTable, model: ErrorModel) -> np.ndarray:
     same = (table.sides[:, None] == table.sides) & (table.frames[:, None] == table.frames)
     R = R + model.side_frame * same
     R = R + model.match * np.eye(len(table.r))
+    top = np.flatnonzero(table.sides == TOP)
+    if len(top):
+        own = table.take(top)
+        _, which = np.unique(own.frames, return_inverse=True)
+        moments = own.level.moments(own.root_weights**2, which, int(which.max()) + 1).sum(axis=0)
+        errors = np.zeros(len(table.r))
+        errors[top] = own.level.errors
+        R = R + shares_that_stay(moments[None])[0] * np.outer(errors, errors)
     rows = table.root_weights[:, None] * table.J.toarray()
     return rows.T @ R @ rows
 
@@ -103,7 +117,7 @@ def test_score_variance_of_weighted_matches(seed: int, model: ErrorModel) -> Non
 
 
 def test_independent_matches_keep_their_information() -> None:
-    table = random_table(0)
+    table = replace(random_table(0), level=LevelEdges.none(40))
     np.testing.assert_allclose(table.scores.variance(ErrorModel(0.0, 0.0, 1.0)), gram(table.J))
     np.testing.assert_allclose(table.scores.excess(ErrorModel(0.0, 0.0, 1.0)), 0.0, atol=1e-12)
 
@@ -117,14 +131,15 @@ def test_frames_add_up_and_can_be_left_out(seed: int) -> None:
     expected = table.scores.variance(model)
     np.testing.assert_allclose((one + two + three).variance(model), expected, rtol=1e-9)
     np.testing.assert_allclose((table.scores - three).variance(model), (one + two).variance(model), rtol=1e-9)
-    dense = ScoreSums.of_frame(parts[0].J.toarray(), parts[0].root_weights, parts[0].sides)
+    first = parts[0]
+    dense = ScoreSums.of_frame(first.J.toarray(), first.root_weights, first.sides, first.level)
     np.testing.assert_allclose(dense.variance(model), one.variance(model), rtol=1e-9)
     columns = np.array([9, 0, 3, 4, 1, 7, 2, 5])
     apart = total(10, [one, two, three], [columns] * 3)
     np.testing.assert_allclose(apart.columns(columns).variance(model), expected, rtol=1e-9)
     assert not apart.independent[[6, 8]].any()
     closed = (one + two + three).without_sides([0, 2])
-    assert closed.sides.tolist() == [1, SIDES]
+    assert closed.sides.tolist() == [1, SIDES] and closed.level.closed.any()
     np.testing.assert_allclose(closed.variance(model), expected, rtol=1e-9)
     T = np.random.default_rng(seed).normal(size=(5, 8))
     np.testing.assert_allclose(closed.transformed(T).variance(model), T @ expected @ T.T, rtol=1e-9)

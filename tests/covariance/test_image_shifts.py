@@ -8,6 +8,7 @@ from scipy.sparse import csr_array
 
 from sst_graph.association.edge_matching import SIDES
 from sst_graph.covariance.image_shifts import ImageShifts, shifts_of
+from sst_graph.covariance.level_edges import LevelEdges
 from sst_graph.covariance.match_table import MatchTable
 
 IMAGES, OBJECTS, POINTS, SIGMA_PX = 60, 5, 8, 0.5
@@ -26,7 +27,7 @@ def drawn(
     side_errors = of_side * rng.normal(size=(len(shifts_px), OBJECTS * SIDES))[images, side]
     r = (H * shifts_px[images]).sum(axis=1) + side_errors + rng.normal(size=len(side))
     ones = np.ones(len(side))
-    return MatchTable(csr_array(H), ones, ones, r, side, images), H, images
+    return MatchTable(csr_array(H), ones, ones, r, side, images, LevelEdges.none(len(side))), H, images
 
 
 def estimated(table: MatchTable, H: FloatArray, images: FloatArray) -> tuple[FloatArray, ImageShifts]:

@@ -50,7 +50,7 @@ def moving(pair: PairMatches, track: int) -> PairMatches:
 
 def without(pair: PairMatches, track: int) -> PairMatches:
     kept, matches = np.flatnonzero(~of_track(pair, track)), pair.matches[VEHICLE]
-    part = {name: getattr(matches, name)[kept] for name in ("objects", "sides", "index")}
+    part = {name: getattr(matches, name)[kept] for name in ("objects", "sides", "index", "level_px")}
     fewer = dataclasses.replace(matches, alignment=matches.alignment.take(kept), **part)
     return dataclasses.replace(pair, matches={VEHICLE: fewer}, tracks={VEHICLE: pair.tracks[VEHICLE][kept]})
 

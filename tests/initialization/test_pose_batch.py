@@ -48,7 +48,7 @@ def left_edge(u: float, turned: bool = False) -> tuple[Drive, GraphConfig]:
     y = np.linspace(-2.0, 2.0, 20)
     lPs = np.stack([np.full(20, (u - 320.0) / 10.0), y, np.full(20, 10.0)], axis=1)
     zeros, outward = np.zeros(20, np.intp), np.array([0.02 if turned else -0.02, 0.0, 0.0])
-    points = Boundaries(lPs, lPs + outward, np.full(20, 0.01), np.zeros(20), zeros.astype(np.uint8), zeros)
+    points = Boundaries(lPs, lPs + outward, zeros, np.zeros(20), zeros.astype(np.uint8), zeros)
     scan = scan_of(0, {VEHICLE: points})
     image = ImageFeatures(0, 0, mask, {VEHICLE: contour})
     config = GraphConfig(side_sigma_px=1e-3)

@@ -32,7 +32,7 @@ def boundaries(*centres: np.ndarray) -> Boundaries:
     lPs = np.concatenate([centre + around for centre in centres])
     n = len(lPs)
     numbers = np.repeat(np.arange(len(centres)), 12)
-    return Boundaries(lPs, lPs.copy(), np.ones(n), np.zeros(n), np.zeros(n, np.uint8), numbers)
+    return Boundaries(lPs, lPs.copy(), np.ones(n, np.intp), np.zeros(n), np.zeros(n, np.uint8), numbers)
 
 
 def drive(*paths: Callable[[float], np.ndarray]) -> Drive:

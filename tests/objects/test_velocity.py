@@ -29,7 +29,9 @@ def _scan(stamp_ns: int, wTl: gtsam.Pose3, corners: FloatArray) -> ScanFeatures:
     n = len(lPs)
     edges = np.full(n, Edge.SIDE, np.uint8)
     edges[len(wPs) :] = Edge.TOP
-    found = {VEHICLE: Boundaries(lPs, lPs.copy(), np.ones(n), np.zeros(n), edges, np.zeros(n, np.intp))}
+    found = {
+        VEHICLE: Boundaries(lPs, lPs.copy(), np.ones(n, np.intp), np.zeros(n), edges, np.zeros(n, np.intp))
+    }
     none = np.zeros((0, 3))
     return ScanFeatures(0, stamp_ns, found, none, np.zeros(0, np.uint8), none[:, 0], none, none[:, 0])
 

@@ -14,6 +14,7 @@ from alignment_streets import D, E, Street, simulated_street
 from sst_graph import AlignmentKeys, Trajectory, calibration_covariance, solve_with_terms
 from sst_graph.association.edge_matching import SIDES
 from sst_graph.covariance.error_model import ErrorModel
+from sst_graph.covariance.level_edges import LevelEdges
 from sst_graph.errors import EstimationError
 from sst_graph.factors import FactorError
 from sst_graph.slam.alignment_keys import COLUMNS, bias_column
@@ -48,7 +49,8 @@ def random_rows(images: int = 12, objects: int = 5, matches: int = 20, seed: int
         J = np.zeros((n, COLUMNS))
         J[:, :7], J[:, COLUMN] = rng.normal(size=(n, 7)), 1.0
         sides = np.repeat(np.arange(objects) * SIDES, matches) + rng.integers(0, 2, n)
-        found.append(TermRows(J, np.zeros(n), rng.uniform(0.2, 1.0, n), rng.uniform(0.5, 2.0, n), sides))
+        weights, sigmas_px = rng.uniform(0.2, 1.0, n), rng.uniform(0.5, 2.0, n)
+        found.append(TermRows(J, np.zeros(n), weights, sigmas_px, sides, LevelEdges.none(n)))
     return found
 
 

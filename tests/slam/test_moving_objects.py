@@ -31,7 +31,7 @@ def box_scan(k: int, centres: list[np.ndarray]) -> tuple[ScanFeatures, gtsam.Pos
             objects += [number] * len(HEIGHTS)
     lPs, n = np.stack(parts), len(parts)
     edges = np.full(n, Edge.SIDE, np.uint8)
-    points = Boundaries(lPs, lPs.copy(), np.ones(n), np.zeros(n), edges, np.array(objects, np.intp))
+    points = Boundaries(lPs, lPs.copy(), np.ones(n, np.intp), np.zeros(n), edges, np.array(objects, np.intp))
     none = np.zeros((0, 3))
     scan = ScanFeatures(
         k, k * 100_000_000, {OBJECT: points}, none, np.zeros(0, np.uint8), none[:, 0], none, none[:, 0]

@@ -18,6 +18,7 @@ from sst_graph.batch.assumption_tests import with_test_results
 from sst_graph.config import with_overrides
 from sst_graph.covariance.cluster_robust import robust_covariance
 from sst_graph.covariance.considered import AssumptionConfig, considered_by_matches
+from sst_graph.covariance.level_edges import MOMENTS, LevelSums
 from sst_graph.covariance.sums import ScoreSums
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import ImageFeatures, prepare_drive
@@ -185,13 +186,16 @@ def test_new_unknowns_come_before_what_is_held() -> None:
     sums, rng = RunningSums.empty(4, held=2), np.random.default_rng(3)
     A = rng.standard_normal((9, 6))
     H = A.T @ A
-    sums.scores = ScoreSums(H, H, H, np.array([5]), A[:1])
+    sums.scores = ScoreSums(
+        H, H, H, np.array([5]), A[:1], LevelSums(A[1:2], np.ones((1, MOMENTS)), H, np.eye(3))
+    )
     sums.grow(5)
     there, grown = [0, 1, 2, 3, 5, 6], sums.scores
-    for M in (grown.independent, grown.side_frames, grown.closed):
+    for M in (grown.independent, grown.side_frames, grown.closed, grown.level.closed):
         np.testing.assert_array_equal(M[np.ix_(there, there)], H)
         assert not M[4].any()
-    assert grown.scores[0].tolist() == np.insert(A[0], 4, 0.0).tolist()
+    for rows, old in ((grown.scores, A[0]), (grown.level.scores, A[1])):
+        assert rows[0].tolist() == np.insert(old, 4, 0.0).tolist()
     assert sums.objects.closed.shape == (5, 5)
 
 

@@ -38,7 +38,9 @@ def _scan(k: int, wTl: gtsam.Pose3) -> ScanFeatures:
     centres = {n: wTl.transformTo(centre) for n, centre in _objects(k).items()}
     lPs = np.stack(list(centres.values()))
     m, nothing = len(lPs), np.zeros(0)
-    edges = Boundaries(lPs, lPs, np.ones(m), np.zeros(m), np.zeros(m, np.uint8), np.array(list(centres)))
+    edges = Boundaries(
+        lPs, lPs, np.ones(m, np.intp), np.zeros(m), np.zeros(m, np.uint8), np.array(list(centres))
+    )
     empty = np.zeros((0, 3))
     return ScanFeatures(
         k,

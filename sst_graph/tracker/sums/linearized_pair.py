@@ -9,6 +9,7 @@ import numpy as np
 
 from sst_graph.association.edge_matching import SIDES, MatchConfig
 from sst_graph.covariance.error_model import SideResiduals
+from sst_graph.covariance.level_edges import LevelEdges
 from sst_graph.covariance.match_table import curvatures_of, unweighted
 from sst_graph.covariance.static_objects import dynamic_matches
 from sst_graph.covariance.sums import ScoreSums
@@ -130,7 +131,9 @@ def linearize_pair(
     J = J - JV @ gain  # sensitivity of the estimate to a residual, the twist at its optimum
     track = np.concatenate([columns.tracks_of(pair, c) for c in pair.matches])
     side = track * SIDES + np.concatenate([m.sides for m in pair.matches.values()])
-    own, scores = roots / np.sqrt(share), ScoreSums.of_frame(J, roots, side)
+    own = roots / np.sqrt(share)
+    level = [LevelEdges.of(each.alignment, each.level_px, pair.wTl) for each in pair.matches.values()]
+    scores = ScoreSums.of_frame(J, roots, side, LevelEdges.joined(level))
     return LinearizedPair(
         information,
         observed,

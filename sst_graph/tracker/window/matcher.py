@@ -179,7 +179,7 @@ class WindowMatcher:
         for c, m in pair.matches.items():
             kept = np.flatnonzero([tracks[c, int(name)] not in out for name in m.objects])
             if len(kept):
-                part = {name: getattr(m, name)[kept] for name in ("objects", "sides", "index")}
+                part = {name: getattr(m, name)[kept] for name in ("objects", "sides", "index", "level_px")}
                 matches[c] = replace(m, alignment=m.alignment.take(kept), **part)
                 if c in pair.tracks:
                     own[c] = pair.tracks[c][kept]
@@ -247,7 +247,7 @@ class WindowMatcher:
             self._twists = (self.window.next_scan, Tracks([part], growing=self._growing))
         twists = self._twists[1]
         return (
-            twists.with_objects(*self.window.objects_of(numbers))
+            twists.with_objects(*self.window.objects_of(numbers), self.window.poses_of(numbers))
             if self.graph.object_bias_sigma_px > 0.0
             else twists
         )

@@ -52,6 +52,7 @@ class Window:
         sampled: latest scans of which the sample of labelled points is kept: the search uses no others.
         growing: no scan leaves; afterwards two leave with each that comes, until ``size`` are left.
         tracks: track of each (class, object) of a scan, by the scan's number.
+        poses: of each scan in the world.
         dynamics: which objects are dynamic.
         image_pairs: what consecutive images show of the camera's motion, where that is asked for.
         labelled_ns: stamps of the scans and of the images that have labels, where edges are aligned, too.
@@ -87,6 +88,7 @@ class Window:
         self.image_pairs: deque[ImagePair] = deque(maxlen=self.size + 10)
         self.labelled_ns: tuple[set[int], set[int]] = (set(), set())
         self.tracks: dict[int, dict[ObjectName, int]] = {}
+        self.poses: dict[int, gtsam.Pose3] = {}
         self.dynamics = DynamicObjectTest()
         self.wTl = gtsam.Pose3()
 
@@ -160,8 +162,9 @@ class Window:
         self._thin_out()
         self.tracks[number] = self.objects.add(features.boundaries, self.wTl)
         self.dynamics.add(number, lean, self.tracks[number], self.wTl, self.first_scan)
+        self.poses[number] = self.wTl
         for old in [k for k in self.tracks if k < self.first_scan]:
-            del self.tracks[old]
+            del self.tracks[old], self.poses[old]
         self.labelled_ns[0].intersection_update(scan.stamp_ns for _, scan in self.scans)
         return number
 
@@ -206,6 +209,10 @@ class Window:
             found = self.dynamics.dynamic_objects(number)
             dynamic.update({(position, c, n): one for (c, n), one in found.items()})
         return tracks, dynamic
+
+    def poses_of(self, numbers: Sequence[int]) -> list[gtsam.Pose3]:
+        """Of some scans, in the world."""
+        return [self.poses[number] for number in numbers]
 
     def add_image(self, features: ImageFeatures, pair: ImagePair | None = None) -> None:
         """Keep an image, with a number of its own, in the order of stamps.
