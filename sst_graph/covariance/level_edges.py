@@ -106,11 +106,15 @@ class LevelSums:
     scatter: FloatArray
 
     @classmethod
-    def of_open(cls, scores: FloatArray, moments: FloatArray | None = None) -> LevelSums:
-        """Of sides none of which is closed; moments: None where there is no level edge."""
-        k, n = scores.shape
-        moments = np.zeros((k, MOMENTS)) if moments is None else moments
+    def of_open(cls, scores: FloatArray, moments: FloatArray) -> LevelSums:
+        """Of sides none of which is closed."""
+        n = scores.shape[1]
         return cls(scores, moments, np.zeros((n, n)), np.zeros((3, 3)))
+
+    @classmethod
+    def none(cls, n: int) -> LevelSums:
+        """Of no side."""
+        return cls.of_open(np.zeros((0, n)), np.zeros((0, MOMENTS)))
 
     def columns(self, some: IntArray | slice) -> LevelSums:
         """In some of the unknowns."""

@@ -54,7 +54,7 @@ class ScoreSums:
     @classmethod
     def none(cls, n: int) -> ScoreSums:
         """Of no match."""
-        nothing, level = np.zeros((n, n)), LevelSums.of_open(np.zeros((0, n)))
+        nothing, level = np.zeros((n, n)), LevelSums.none(n)
         return cls(nothing, nothing, nothing, np.zeros(0, np.intp), np.zeros((0, n)), level)
 
     @classmethod
@@ -64,34 +64,29 @@ class ScoreSums:
         roots: FloatArray,
         sides: IntArray,
         frames: IntArray,
-        level: LevelEdges | None = None,
+        level: LevelEdges,
     ) -> ScoreSums:
         """Of matches, from rows a (m, n), roots of the weights, sides and numbers of the frames (m,).
 
         Args:
-            level: which of them lie on level edges; None: none does.
+            level: which of them lie on level edges.
         """
         first, which = by_side_and_frame(sides, frames)
         by_frame = _members(which, len(first), roots) @ J
         names, side = np.unique(sides[first], return_inverse=True)
         sides_of = _members(side.reshape(-1), len(names), np.ones(len(first)))
-        scores, errors = _dense(sides_of @ by_frame), LevelSums.of_open(np.zeros((len(names), J.shape[1])))
-        if level is not None:
-            by_edge = _dense(sides_of @ (_members(which, len(first), roots * level.errors) @ J))
-            errors = LevelSums.of_open(by_edge, sides_of @ level.moments(roots**2, which, len(first)))
-        return cls(gram(J), gram(by_frame), np.zeros((J.shape[1],) * 2), names, scores, errors)
+        by_edge = sides_of @ (_members(which, len(first), roots * level.errors) @ J)
+        errors = LevelSums.of_open(_dense(by_edge), sides_of @ level.moments(roots**2, which, len(first)))
+        scores, square = _dense(sides_of @ by_frame), (J.shape[1],) * 2
+        return cls(gram(J), gram(by_frame), np.zeros(square), names, scores, errors)
 
     @classmethod
-    def of_frame(
-        cls, J: FloatArray, roots: FloatArray, sides: IntArray, level: LevelEdges | None = None
-    ) -> ScoreSums:
+    def of_frame(cls, J: FloatArray, roots: FloatArray, sides: IntArray, level: LevelEdges) -> ScoreSums:
         """Of the matches of one frame, from dense rows."""
         names, scores = summed_rows(J * roots[:, None], sides)
-        errors = LevelSums.of_open(np.zeros_like(scores))
-        if level is not None:
-            _, by_edge = summed_rows(J * (roots * level.errors)[:, None], sides)
-            moments = level.moments(roots**2, np.searchsorted(names, sides), len(names))
-            errors = LevelSums.of_open(by_edge, moments)
+        _, by_edge = summed_rows(J * (roots * level.errors)[:, None], sides)
+        moments = level.moments(roots**2, np.searchsorted(names, sides), len(names))
+        errors = LevelSums.of_open(by_edge, moments)
         return cls(J.T @ J, scores.T @ scores, np.zeros((J.shape[1],) * 2), names, scores, errors)
 
     def __add__(self, other: ScoreSums) -> ScoreSums:
@@ -153,7 +148,7 @@ def total(n: int, parts: Sequence[ScoreSums], columns: Sequence[IntArray]) -> Sc
     independent, side_frames = scattered(
         n, columns, [part.independent for part in parts], [part.side_frames for part in parts]
     )
-    closed, level = np.zeros((n, n)), LevelSums.of_open(np.zeros((0, n)))
+    closed, level = np.zeros((n, n)), LevelSums.none(n)
     for part, own in zip(parts, columns, strict=True):
         if part.closed.any():
             closed[np.ix_(own, own)] += part.closed

@@ -159,7 +159,9 @@ class Tracks:
         self._twists: list[SensorTwists | None] = [
             (growing or GrowingTwists()).of(drive.lidar_motions) for drive in drives
         ]
-        self._poses: list[Sequence[gtsam.Pose3]] = [] if growing else [scan_poses(d) for d in drives]
+        self._poses: list[Sequence[gtsam.Pose3 | None]] = [
+            scan_poses(drive) if growing is None else () for drive in drives
+        ]
         self.objects: Sequence[Mapping[ObjectId, int]] | None = objects
         found = zip(drives, objects, strict=True) if objects is not None else ()
         self._dynamic = [_by_scan(find_dynamic_objects(drive, tracks)) for drive, tracks in found]
@@ -180,7 +182,7 @@ class Tracks:
         """The tracks of some scans of one drive (:meth:`Drive.part`), which becomes drive 0."""
         other, place = Tracks([]), {position: k for k, position in enumerate(scans)}
         other._twists = [self._twists[drive]]
-        other._poses = [[self._poses[drive][k] for k in scans]]
+        other._poses = [[self.pose(drive, k) for k in scans]]
         if self.objects is not None:
             other.objects = [tracks_of_scans(self.objects[drive], scans)]
             moving = self._dynamic[drive]
@@ -204,7 +206,7 @@ class Tracks:
 
     def pose(self, drive: int, scan: int) -> gtsam.Pose3 | None:
         """Pose of a scan in the world, by its position; None where it is not known."""
-        poses = self._poses[drive] if self._poses else ()
+        poses = self._poses[drive]
         return poses[scan] if scan < len(poses) else None
 
     def at(self, drive: int, stamp_ns: int) -> TwistSample | None:

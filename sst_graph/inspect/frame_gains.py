@@ -222,7 +222,7 @@ def _scores(table: MatchTable, rows: IntArray, term: FrameTerm) -> ScoreSums:
     """Sums of the scores of some matches, in the columns of their frame."""
     some = table.take(rows)
     J = some.J[:, term.columns].toarray()
-    return ScoreSums.of(J, some.root_weights, some.sides, some.frames)
+    return ScoreSums.of(J, some.root_weights, some.sides, some.frames, some.level)
 
 
 def _view(

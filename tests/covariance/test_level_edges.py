@@ -90,7 +90,9 @@ def test_the_mean_of_level_edges_errs_as_the_variance_says() -> None:
         shared = 0.8 * rng.uniform(-np.sqrt(3.0), np.sqrt(3.0), edges)
         errors.append(float((shared[edge] + rng.normal(size=len(edge))).mean()))
     assert np.var(errors) == pytest.approx(predicted, rel=0.08)
-    alone = bread**2 * ScoreSums.of(J, roots, edge * 4 + 2, frame).variance(ErrorModel(0.0, 0.0, 1.0))[0, 0]
+    alone = (
+        bread**2 * ScoreSums.of(J, roots, edge * 4 + 2, frame, LevelEdges.none(len(edge))).independent[0, 0]
+    )
     assert predicted > 30.0 * alone
 
 

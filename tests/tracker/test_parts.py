@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sst_graph.covariance.error_model import ErrorModel, SideResiduals, fit_error_model
+from sst_graph.covariance.level_edges import LevelEdges
 from sst_graph.covariance.sums import ScoreSums
 from sst_graph.tracker.config import AlarmConfig, TrackerConfig
 from sst_graph.tracker.monitor.confirmation import (
@@ -103,7 +104,7 @@ def _score(rng: np.random.Generator, truth: FloatArray, side: int) -> Linearized
     residuals = SideResiduals.of(r, ones, side + which, still)
     point = Point(gtsam.Pose3(), 0.0, np.zeros(2))
     information = Gaussian(point, J.T @ J, -J.T @ r)
-    scores = ScoreSums.of_frame(J, ones, side + which)
+    scores = ScoreSums.of_frame(J, ones, side + which, LevelEdges.none(200))
     return LinearizedPair(information, information, scores, residuals, 200)
 
 
