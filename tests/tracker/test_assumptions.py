@@ -98,6 +98,20 @@ def _state(tracker: Tracker) -> State:
 
 
 @pytest.mark.slow
+def test_matches_of_a_moving_window_stay_in_the_world_of_the_drive(leaving: Tracker) -> None:
+    assert leaving.estimate.smoother is not None
+    entries = leaving.estimate.smoother.entries
+    first = min(entries)
+    assert first > 0
+    for number, entry in entries.items():
+        assert entry.pair.wTl is not None and entry.pair.wTl.equals(leaving.inputs.window.poses[number], 1e-9)
+    assert np.linalg.norm(leaving.inputs.window.poses[first].translation()) > 1.0
+    # Level edges have left the window, too, and what stays of their errors counts.
+    level = leaving.estimate.smoother.sums.scores.level
+    assert np.linalg.eigvalsh(level.variance())[-1] > 0.0
+
+
+@pytest.mark.slow
 def test_what_the_tracker_considers_is_what_the_batch_does(optimized: Tracker) -> None:
     """The batch's function on the window's own matches, at the tracker's state."""
     assert optimized.estimate.smoother is not None

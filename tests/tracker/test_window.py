@@ -10,7 +10,7 @@ from sst_graph.drive.preparation import Drive, ScanFeatures
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.lidar_edges import Boundaries
 from sst_graph.objects.dynamic_objects import find_dynamic_objects
-from sst_graph.objects.tracks import object_tracks
+from sst_graph.objects.tracks import object_tracks, scan_poses
 from sst_graph.objects.velocity import ObjectVelocity
 from sst_graph.tracker.window.window import OBJECT_MEMORY, Window
 from sst_graph.types import RelativeMotion, SemanticClass
@@ -84,6 +84,15 @@ def test_dynamic_objects_are_those_of_the_batch() -> None:
     for name, mover in speeds.items():
         assert moving[name].speed_mps == pytest.approx(mover.speed_mps)
         assert moving[name].unknown_mps == pytest.approx(mover.unknown_mps)
+
+
+def test_poses_are_kept_as_long_as_their_scans() -> None:
+    drive = _drive(20)
+    window, poses = _window(drive, 8), scan_poses(drive)
+    numbers = [number for number, _ in window.scans]
+    assert 0 < len(numbers) <= 8 and sorted(window.poses) == numbers
+    for number, wTl in zip(numbers, window.poses_of(numbers), strict=True):
+        assert wTl.equals(poses[number], 1e-9)
 
 
 def test_an_object_that_starts_to_move_changes_past_scans() -> None:
