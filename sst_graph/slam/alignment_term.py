@@ -337,6 +337,7 @@ class AlignmentTerm:
             return TermRows.none()
         scan_ns, wTl = self.features[place.scan].stamp_ns, self._wTl(values, place.between.X_s)
         found, parts = matches.found, []
+        near = sides.near(wTl)
         for c, alignment, of_object, numbers, (r, J) in zip(
             found.classes,
             found.alignments,
@@ -354,7 +355,7 @@ class AlignmentTerm:
                 columns[:, POSITIONS] = beams[:, :2]
             own = level_sigmas(of_object, alignment.sigmas_px, self.config.match)
             level_px = own if c != SemanticClass.OBJECT else np.zeros(len(own))
-            level = replace(LevelEdges.of(alignment, level_px, wTl), errors=level_px)
+            level = replace(LevelEdges.of(alignment, level_px, near), errors=level_px)
             parts.append(TermRows(columns, r, weights, alignment.sigmas_px, numbers, level))
         return TermRows.joined(parts)
 

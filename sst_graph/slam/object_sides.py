@@ -33,6 +33,7 @@ class ObjectSides:
     """Numbers for the sides of objects, the same in every image."""
 
     def __init__(self) -> None:
+        self._origin: FloatArray | None = None
         self._tracks: list[_Track] = []
         self._names: dict[tuple[int, SemanticClass, int], int] = {}
 
@@ -55,6 +56,13 @@ class ObjectSides:
                 tracks[own] = self._track((scan_ns, c, int(number)), centre)
             numbers.append(tracks * SIDES + sides)
         return numbers
+
+    def near(self, wTl: gtsam.Pose3) -> gtsam.Pose3:
+        """The pose in axes that begin where the first one is: sums of squares of places near it are exact,
+        wherever the world begins."""
+        if self._origin is None:
+            self._origin = np.asarray(wTl.translation())
+        return gtsam.Pose3(wTl.rotation(), wTl.translation() - self._origin)
 
     def _track(self, name: tuple[int, SemanticClass, int], centre: FloatArray) -> int:
         """The track of an object of a scan: the nearest of its class that the scan has not named yet."""

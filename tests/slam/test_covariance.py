@@ -31,6 +31,7 @@ from sst_graph.slam.covariance import (
     times_too_sure,
     total,
 )
+from sst_graph.slam.object_sides import ObjectSides
 from sst_graph.slam.solving import RematchSolution
 from sst_graph.slam.term_warnings import WarningKind
 from sst_graph.types import SemanticClass
@@ -222,6 +223,25 @@ def test_matches_that_count_in_full_are_too_sure(steady: Street, solution: Remat
     ratios = np.diag(scaled.covariance) / np.diag(by_hand.covariance)
     assert ratios.min() > 0.8 and ratios.max() < 1.25
     assert scaled.times_too_sure < 0.8 * by_hand.times_too_sure
+
+
+def test_places_of_level_edges_do_not_hang_on_where_the_world_begins(steady: Street) -> None:
+    """As far away as the coordinates of a country are, squares of places would have no digit left."""
+    keys = AlignmentKeys(steady.trajectory(), E, D)
+    _, values = steady.whole(steady.start(1))
+    far = gtsam.Values(values)
+    for pose in filter(keys.trajectory.__contains__, values.keys()):
+        wTb = values.atPose3(pose)
+        far.update(pose, gtsam.Pose3(wTb.rotation(), wTb.translation() + np.array([5e5, 5.4e6, 400.0])))
+    found = []
+    for each in (values, far):
+        sides, places = ObjectSides(), []
+        for k in (0, 5):
+            term = steady.term(k, keys)
+            places.append(term.rows(term.matched(each, 4.0), sides, each).level.places)
+        found.append(np.concatenate(places))
+    assert len(found[0]) > 100 and np.abs(found[0]).max() < 200.0
+    np.testing.assert_allclose(found[1], found[0], atol=1e-5)
 
 
 def _graph_of(matches: Sequence[TermMatches]) -> gtsam.NonlinearFactorGraph:
