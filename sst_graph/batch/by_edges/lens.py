@@ -6,12 +6,8 @@ together. Their deviations are those of its half-samples (:mod:`sst_graph.batch.
 estimate over its deviation decides (Wald), by Student's t with one degree of freedom less than there are
 half-samples.
 
-Motion is measured with the lens as given, and takes a wrong principal point for a turn of the camera: its
-rotation does not hold the principal point.
-
 A lens that is contradicted is a reason against the estimate where it matters: where the estimate moves
-farther than it is known when what is contradicted is free. Where it moves less far, that step is added to the
-covariance.
+farther than it is known when the lens is free. Where it moves less far, that step is added to the covariance.
 
 An estimate by labels is tested, too, by edges of some of its frames: those know the principal point several
 times as well as the outlines of a few vehicles.
@@ -30,7 +26,6 @@ from sst_graph.batch.by_edges.covariance import SAMPLES, half_sample_steps
 from sst_graph.batch.by_edges.optimum import START_KERNELS_PX
 from sst_graph.batch.by_edges.problem import (
     EdgesProblem,
-    KnownCalibration,
     LabelEstimate,
     edges_problem,
     problem_of_some_frames,
@@ -72,8 +67,7 @@ class LensTest:
 
     Attributes:
         findings: the most contradicted first; none where nothing was tested.
-        step: (7,) from the estimate to that with what is contradicted free [rad, m, s]; None where nothing
-            is. What the data leave open moves the estimate, too, and says nothing.
+        step: (7,) from the estimate to that with the lens free [rad, m, s].
     """
 
     findings: tuple[ParameterTest, ...] = ()
@@ -107,7 +101,7 @@ class LensTest:
         figures = ", ".join(each.assumption.figure(each.value, each.sigma) for each in self.contradicted)
         degrees, metres = (float(np.linalg.norm(self.step[own])) for own in (slice(0, 3), slice(3, 6)))
         return (
-            f"the lens is a little off, and the sigmas cover it: {figures}; with that free the "
+            f"the lens is a little off, and the sigmas cover it: {figures}; with the lens free the "
             f"estimate moves by {np.degrees(degrees):.2f} deg, {100.0 * metres:.1f} cm and "
             f"{1e3 * self.step[6]:+.1f} ms",
         )
@@ -140,17 +134,22 @@ def lens_steps(
     names = [name for name, each in ASSUMPTIONS.items() if each.by_edges and name not in estimated]
     if not config.test or not names:
         return LensTest()
-    free, known = _with_free_lens(edges, names)
+    graph = replace(graph, estimate=(*graph.estimate, *names))
+    free = replace(problem, config=replace(problem.config, graph=graph))
     start = replace(state, nuisances={**state.nuisances, **dict.fromkeys(names, 0.0)})
     # Soft matches follow a wrong lens for many steps. What moves by a fifth of a sigma after the first ones
     # decides nothing where others test the same.
     few = replace(free, config=replace(free.config, max_outer=len(START_KERNELS_PX)))
     try:
-        found = yield from _freed(free, start, free if beside is None else few)
+        wide = yield from solution_steps(free if beside is None else few, start, START_KERNELS_PX)
+        found = yield from _near(free, wide.state)
+        met, expected = _support(free, found, start)
+        if met < _LOST * expected:
+            found = yield from _near(free, start)
     except EstimationError:
         return LensTest()
     # Half of the objects, and half of what else is known: but for chance, their optimum is that of the whole.
-    halves = replace(free, prior=known.factor(0.5))
+    halves = replace(free, prior=edges.known.factor(0.5))
 
     def settled(steps: Mapping[str, FloatArray]) -> bool:
         if beside is None:
@@ -162,46 +161,8 @@ def lens_steps(
     if settled(steps):
         return LensTest()
     findings = [_finding(name, found.nuisances[name], steps[name], config.threshold) for name in names]
-    sorted_findings = sorted((each for each in findings if each is not None), key=lambda each: -each.score)
-    tested = LensTest(tuple(sorted_findings))
-    if not tested.contradicted:
-        return tested
-    # What is contradicted alone.
-    wrong = [each.assumption.name for each in tested.contradicted]
-    only, _ = _with_free_lens(edges, wrong)
-    start = replace(state, nuisances={**state.nuisances, **dict.fromkeys(wrong, 0.0)})
-    try:
-        moved = yield from _freed(only, start, only)
-    except EstimationError:
-        moved = found
-    return replace(tested, step=difference(state, moved))
-
-
-def _with_free_lens(edges: EdgesProblem, names: Sequence[str]) -> tuple[JointProblem, KnownCalibration]:
-    """The problem with these parameters as further unknowns, and what is known beside its edges."""
-    problem, graph = edges.whole, edges.whole.config.graph
-    spans = {name: ASSUMPTIONS[name].span for name in names}
-    known = edges.known.with_free_principal_point(problem.drives[0].camera, spans)
-    graph = replace(graph, estimate=(*graph.estimate, *names))
-    config = replace(problem.config, graph=graph)
-    return replace(problem, config=config, prior=known.factor()), known
-
-
-def _freed(problem: JointProblem, start: State, first: JointProblem) -> Stepwise[State]:
-    """The solution with further unknowns, from one without.
-
-    Args:
-        first: the same problem, for the wide kernels.
-
-    Raises:
-        EstimationError: too few matches.
-    """
-    wide = yield from solution_steps(first, start, START_KERNELS_PX)
-    found = yield from _near(problem, wide.state)
-    met, expected = _support(problem, found, start)
-    if met < _LOST * expected:
-        found = yield from _near(problem, start)
-    return found
+    known = sorted((each for each in findings if each is not None), key=lambda each: -each.score)
+    return LensTest(tuple(known), difference(state, found))
 
 
 def _near(problem: JointProblem, start: State) -> Stepwise[State]:

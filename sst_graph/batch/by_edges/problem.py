@@ -3,7 +3,7 @@ edges."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -11,7 +11,6 @@ import gtsam
 import numpy as np
 
 from sst_graph.association.time_pairing import pair_by_time
-from sst_graph.assumptions import named_sigmas
 from sst_graph.batch.by_edges.parts import thinned
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.motion_factor import gaussian_factor
@@ -20,7 +19,6 @@ from sst_graph.drive.edges_of_frames import with_edges
 from sst_graph.drive.preparation import Drive, PrepareConfig, Progress
 from sst_graph.edges.search import KnownRotation, SearchRegion, angle_deg
 from sst_graph.errors import EstimationError
-from sst_graph.factors.camera import PinholeCamera
 from sst_graph.graph.matching import DriveEdges, Tracks, edges_of
 from sst_graph.graph.outer_loop import JointProblem
 from sst_graph.graph.state import State, difference
@@ -64,23 +62,6 @@ class KnownCalibration:
     def factor(self, share: float = 1.0) -> gtsam.NonlinearFactor:
         """In the joint graph, with a share of its information."""
         return gaussian_factor(self.state, self.covariance / share)
-
-    def with_free_principal_point(
-        self, camera: PinholeCamera, sigmas_px: Mapping[str, float]
-    ) -> KnownCalibration:
-        """What is known where the principal point is an unknown: motion takes each pixel that it is off for a
-        turn of the camera by 1 / f.
-
-        Args:
-            sigmas_px: its deviations by name ("cx", "cy"); what is missing is held.
-        """
-        right, down = sigmas_px.get("cx", 0.0) / camera.fx, sigmas_px.get("cy", 0.0) / camera.fy
-        # To the right about the camera's y axis, down about its x axis.
-        c_turns = np.diag([down, right, 0.0])
-        covariance = self.covariance.copy()
-        l_turns = self.state.cTl.rotation().matrix().T @ c_turns
-        covariance[:3, :3] += l_turns @ l_turns.T
-        return replace(self, covariance=covariance)
 
 
 @dataclass(frozen=True)
@@ -222,7 +203,6 @@ def edges_problem(
     centre = State(pose, (region.time_offsets_s[0] if offset_known else guess.time_offset_s,))
     guessed = labels.state is None and guess.cTl is not None
     known = _prior(centre, None if labels.has_motion else motion, guessed)
-    known = known.with_free_principal_point(drives[0].camera, dict(named_sigmas(joint.config.graph.estimate)))
     whole = replace(joint, centre=centre, prior=known.factor())
     scans = [_some_scans(drive, guess.time_offset_s) for drive in drives]
     parts = [drive.part(own) for drive, own in zip(drives, scans, strict=True)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import gtsam
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -20,13 +19,12 @@ from sst_graph.batch.by_edges.covariance import SAMPLES
 from sst_graph.batch.by_edges.lens import MATTERS_SIGMAS, LensTest, lens_steps
 from sst_graph.batch.by_edges.optimum import START_KERNELS_PX
 from sst_graph.batch.by_edges.parts import thinned
-from sst_graph.batch.by_edges.problem import KnownCalibration, LabelEstimate, edges_problem
+from sst_graph.batch.by_edges.problem import LabelEstimate, edges_problem
 from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.drive.preparation import Drive
-from sst_graph.factors.camera import PinholeCamera
 from sst_graph.graph.outer_loop import JointProblem, solve_joint
 from sst_graph.graph.state import State
 from sst_graph.simulator import SimulationConfig
@@ -45,22 +43,14 @@ def drive() -> Drive:
     return thinned(prepare_drives([simulated(STREET)], config)[0], 300)
 
 
-def examined(drive: Drive, estimate: Sequence[str] = (), motion_deg: float | None = None) -> LensTest:
-    """The lens of a drive, from a solution that starts at the truth.
-
-    Args:
-        motion_deg: sigma of the rotation by motion, that agrees with the edges by the lens as given [deg].
-    """
+def examined(drive: Drive, estimate: Sequence[str] = ()) -> LensTest:
+    """The lens of a drive, from a solution that starts at the truth."""
     truth = simulated(STREET).truth
     config = CalibrationConfig(method="edges", assumptions=AssumptionConfig(estimate=tuple(estimate)))
     problem = CalibrationProblem.of([drive], Guess(truth.cTl, truth.time_offset_s), config)
     start, kernels_px = State(truth.cTl, (truth.time_offset_s,)), (*START_KERNELS_PX, *NEAR_KERNELS_PX)
     solution = solve_joint(problem.joint(), start, kernels_px)
     edges = edges_problem(problem, None, LabelEstimate(solution.state, has_motion=True))
-    if motion_deg is not None:
-        sigmas = np.array([*np.radians([motion_deg] * 3), 0.1, 0.1, 0.1, 0.004])
-        known = KnownCalibration(solution.state, np.diag(sigmas**2))
-        edges = replace(edges, known=known, whole=replace(edges.whole, prior=known.factor()))
     return run_to_end(lens_steps(edges, solution.state, problem.objects, config.assumptions))
 
 
@@ -82,54 +72,6 @@ def test_a_wrong_principal_point_is_named_with_its_size(drive: Drive) -> None:
     focal, step = drive.camera.fx, found.step
     assert step is not None and abs(step[2]) == pytest.approx(8.0 / focal, rel=0.4)
     np.testing.assert_allclose(np.diag(found.covariance), step**2)
-
-
-@pytest.mark.parametrize("motion_deg", [None, 0.1])
-def test_what_is_not_contradicted_does_not_move_the_estimate(drive: Drive, motion_deg: float | None) -> None:
-    """These edges know cy to 5 px, 0.6 deg of pitch; cx alone is wrong, and turns the estimate."""
-    wrong = replace(drive, camera=replace(drive.camera, cx=drive.camera.cx - 8.0))
-    found = examined(wrong, motion_deg=motion_deg)
-    assert [each.assumption.name for each in found.contradicted] == ["cx"]
-    assert found.step is not None
-    c_turn_deg = np.degrees(simulated(STREET).truth.cTl.rotation().matrix() @ found.step[:3])
-    assert abs(c_turn_deg[0]) < 0.3
-    assert c_turn_deg[1] == pytest.approx(-np.degrees(8.0 / drive.camera.fx), rel=0.4)
-
-
-def test_motion_does_not_hold_the_principal_point(drive: Drive) -> None:
-    """Motion was measured with the lens as given, and takes a wrong principal point for a turn."""
-    wrong = replace(drive, camera=replace(drive.camera, cx=drive.camera.cx - 8.0))
-    found = {each.assumption.name: each for each in examined(wrong, motion_deg=0.1).findings}
-    assert found["cx"].value == pytest.approx(8.0, abs=2.0)
-    # As much as without motion.
-    assert found["cx"].sigma > 1.5 and found["cy"].sigma > 2.5
-
-
-def test_motion_knows_the_pose_less_well_with_a_free_principal_point() -> None:
-    """Each pixel to the right, about the camera's y axis, is the LiDAR's z axis; downwards, its y axis."""
-    cTl = gtsam.Pose3(gtsam.Rot3(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])), np.array([0.0, 0.3, 0.1]))
-    known = KnownCalibration(State(cTl, (0.0,)), np.diag(np.full(7, 1e-4)))
-    camera = PinholeCamera(500.0, 400.0, 320.0, 180.0, 640, 360)
-    freed = known.with_free_principal_point(camera, {"cx": 10.0, "cy": 4.0, "k1": 0.3})
-    more = np.zeros(7)
-    more[2], more[1] = (10.0 / 500.0) ** 2, (4.0 / 400.0) ** 2
-    np.testing.assert_allclose(freed.covariance, known.covariance + np.diag(more), atol=1e-15)
-    held = known.with_free_principal_point(camera, {"k1": 0.3})
-    np.testing.assert_array_equal(held.covariance, known.covariance)
-
-
-def test_motion_does_not_hold_a_principal_point_that_is_estimated(drive: Drive) -> None:
-    truth = simulated(STREET).truth
-    guess, state = Guess(truth.cTl, truth.time_offset_s), State(truth.cTl, (truth.time_offset_s,))
-
-    def covariance(*estimate: str) -> FloatArray:
-        config = CalibrationConfig(method="edges", assumptions=AssumptionConfig(estimate=estimate))
-        problem = CalibrationProblem.of([drive], guess, config)
-        return edges_problem(problem, None, LabelEstimate(state)).known.covariance
-
-    more = np.trace(covariance("cy=20") - covariance())
-    assert more == pytest.approx((20.0 / drive.camera.fy) ** 2, rel=1e-6)
-    assert np.array_equal(covariance("k1"), covariance())
 
 
 def test_half_samples_beside_the_estimate_contradict_no_lens(
