@@ -23,8 +23,8 @@ def test_a_slow_drive_with_a_stop(shift: int) -> None:
     """Images up to 310 ms late. The reference is good to 0.1 deg, 1 cm and 5 ms.
 
     Forward with time offset is at the limit of ok, on either side by start and machine: nine objects leave it
-    open whether k1 is 0. So the errors are judged by the covariance. KITTI's pictures have k1 = 0.0145 +- 0.003
-    by their edges (docs/measured/edges.md): labels may say so, too, and contradict nothing else.
+    open whether k1 is 0. So the errors are judged by the covariance. By their edges KITTI's pictures have
+    k1 = 0.0145 +- 0.003 (docs/measured/edges.md): labels may say so, too, and contradict nothing else.
     """
     drive = open_source(STOP, image_shift=shift)
     result = calibrate(drive, drive.nominal, CalibrationConfig())
