@@ -404,7 +404,9 @@ def match_edges(
         length = length / enlarged
     sigmas = match_sigmas(length, cosine[on], config)
     sides = sides_of(paired.points.edges[index], outward[on, 0])
-    level_px = np.where(paired.by_masks[index], level_sigmas(sides, sigmas, config), 0.0)
+    level_px = level_sigmas(sides, sigmas, config)
+    if shares is not None:
+        level_px = np.where(paired.by_masks[index], level_px, 0.0)
     weights = side_weights(owners, sides, sigmas, config, (level_px, paired.points.rings[index]))
     shares = np.ones(len(index)) if shares is None else shares[near][on]
     weights = weights * shares
@@ -539,8 +541,10 @@ def sides_of(edges: NDArray[np.uint8], to_the_right: FloatArray) -> IntArray:
 def level_sigmas(sides: IntArray, sigmas_px: FloatArray, config: MatchConfig) -> FloatArray:
     """(n,) :func:`sampling_sigmas` of upper and lower edges, whose matches share it [px]: a level edge lies
     between the same two rings all along. 0 at the sides."""
-    level = (sides == TOP) | (sides == BOTTOM)
-    return np.where(level, sampling_sigmas(sigmas_px, config), 0.0)
+    level_px = np.zeros(len(sides))
+    level = np.flatnonzero(sides >= TOP)
+    level_px[level] = sampling_sigmas(sigmas_px.take(level), config)
+    return level_px
 
 
 def side_weights(
@@ -561,8 +565,9 @@ def side_weights(
     shared = _information(numbers, sigmas_px) * shared_px**2
     if level is not None:
         level_px, rings = level
-        count = int(rings.max(initial=0)) + 1
-        shared += _information(numbers * count + rings, sigmas_px) * level_px**2
+        on = np.flatnonzero(level_px)
+        groups = numbers.take(on) * (int(rings.max(initial=0)) + 1) + rings.take(on)
+        shared[on] += _information(groups, sigmas_px.take(on)) * level_px.take(on) ** 2
     return np.asarray(1.0 / (1.0 + shared))
 
 
