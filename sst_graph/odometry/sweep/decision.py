@@ -256,16 +256,17 @@ def _window_around(
     wanted = _spacing(pair)
     every = min(wanted, max(1, (count - 1) // (_WINDOW_SCANS - 1)))
     while True:
-        positions = [k for k in _window_positions(pair, count, every) if scan_at(k) is not None]
-        if len(positions) < 3:
-            return positions, None
-        window = Window([scan for k in positions if (scan := scan_at(k)) is not None], period_s)
+        positions = _window_positions(pair, count, every)
+        scans = {k: scan for k in positions if (scan := scan_at(k)) is not None}
+        if len(scans) < 3:
+            return [], None
+        window = Window([*scans.values()], period_s)
         if window.ok and not _travels(window) and every < wanted:
             every = wanted
         elif not window.ok and every > 1:
             every, wanted = every // 2, every // 2
         else:
-            return positions, window
+            return [*scans], window
 
 
 def _travels(window: Window) -> bool:
