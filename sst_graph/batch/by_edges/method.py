@@ -12,24 +12,27 @@ import numpy as np
 from sst_graph.batch.by_edges.covariance import edges_covariance
 from sst_graph.batch.by_edges.halves import halves_reasons
 from sst_graph.batch.by_edges.lens import lens_steps
-from sst_graph.batch.by_edges.optimum import RESTARTS, best_optimum_steps, refined_steps, starts_steps
+from sst_graph.batch.by_edges.optimum import (
+    RESTARTS,
+    best_optimum_steps,
+    farther_edges_steps,
+    refined_steps,
+    starts_steps,
+)
 from sst_graph.batch.by_edges.problem import LabelEstimate, edges_problem, motion_alone
 from sst_graph.batch.by_edges.reasons import (
     EdgeContrast,
     edge_contrast,
     edges_reasons,
-    wider_kernel_reasons,
     with_lens_reasons,
 )
-from sst_graph.batch.by_edges.solution import WIDER_KERNEL_PX
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import MethodEstimate, frames_used
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate, MatchedDrives
 from sst_graph.batch.total_covariance import sweep_effects
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.fit import Fit, Profile
-from sst_graph.graph.outer_loop import JointSolution, solve_joint
-from sst_graph.graph.state import difference
+from sst_graph.graph.outer_loop import JointSolution
 from sst_graph.hand_eye.solution import MotionSolution
 from sst_graph.quality.profiles import score_profiles
 from sst_graph.stepwise import run_to_end
@@ -67,10 +70,9 @@ def edges_method(
     # 4. Covariance, with what halves of the objects disagree by, edges that are farther away, and the lens.
     estimate, assumptions = JointEstimate.of(solution, calibration.objects), calibration.config.assumptions
     lens = run_to_end(lens_steps(problem, solution.state, calibration.objects, assumptions))
-    wider = solve_joint(problem.whole, solution.state, WIDER_KERNEL_PX)
-    wider_step = difference(solution.state, wider.state)
+    farther_step, unsettled = run_to_end(farther_edges_steps(problem.whole, solution.state))
     own = edges_covariance(problem.whole, estimate, calibration.objects, assumptions, lens.findings)
-    covariance = own.matrix + np.outer(wider_step, wider_step)
+    covariance = own.matrix + np.outer(farther_step, farther_step)
     sweeps = sweep_effects(calibration, solution, covariance)
     covariance = covariance + sweeps.covariance
     lens_reasons, remarks = lens.reasons(covariance), lens.remarks(covariance)
@@ -80,7 +82,7 @@ def edges_method(
         problem.subset_edges, solution.state, [one.state for _, one in candidates], config.seed
     )
     reasons = edges_reasons(solution, contrast, motion, covariance, problem.centre)
-    reasons += wider_kernel_reasons(wider_step)
+    reasons += unsettled
     if config.check_contradictions:
         reasons += halves_reasons(problem.whole, solution.state, covariance)
     # 6. How it fits the pictures, point by point.
@@ -96,7 +98,7 @@ def edges_method(
         remarks,
         by_static_objects=covariance,
         diagnostics=_diagnostics(solution, contrast, motion)
-        | {"spread": {**own.sigmas, "farther_edges": np.abs(wider_step).tolist()}}
+        | {"spread": {**own.sigmas, "farther_edges": np.abs(farther_step).tolist()}}
         | {"assumptions": dict(own.assumptions), "estimated": dict(own.estimated)},
         fit=fit,
         matched=MatchedDrives(matched, solution.state),

@@ -12,7 +12,7 @@ import numpy as np
 
 from sst_graph.batch.by_edges.problem import EdgesProblem
 from sst_graph.batch.by_edges.reasons import SCORE_WORK
-from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX, solution_steps
+from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX, WIDER_KERNEL_PX, solution_steps
 from sst_graph.drive.preparation import Progress
 from sst_graph.edges.agreement import score
 from sst_graph.edges.search import edge_starts_steps, turned
@@ -21,6 +21,7 @@ from sst_graph.graph.matching import edges_of
 from sst_graph.graph.outer_loop import JointProblem, JointSolution
 from sst_graph.graph.state import State, difference
 from sst_graph.stepwise import Stepwise
+from sst_graph.types import FloatArray
 
 START_KERNELS_PX = (10.0, 8.0, 6.0, 5.0, 4.0, 3.0)
 """Scales of the kernel from a start that is a degree off [px]."""
@@ -51,6 +52,9 @@ _MAX_ROUNDS = 10
 """Most times that the near scales are gone through."""
 CONVERGED_STEP = np.array([*np.radians([0.02] * 3), 0.005, 0.005, 0.005, 0.003])
 """(7,) a round that moves by no more is the last [rad, m, s]."""
+_SETTLED_STEP = np.array([*np.radians([0.1] * 3), 0.025, 0.025, 0.025, 0.015])
+"""(7,) farther apart, two solutions are not one optimum [rad, m, s]: right ones came back to within 0.01 deg,
+false ones ended 0.4 deg away."""
 
 
 def starts_steps(problem: EdgesProblem) -> Stepwise[list[State]]:
@@ -160,3 +164,31 @@ def _converged(problem: JointProblem, start: State, progress: Progress | None) -
             break
         state = solution.state
     return solution
+
+
+def farther_edges_steps(
+    problem: JointProblem, estimate: State
+) -> Stepwise[tuple[FloatArray, tuple[str, ...]]]:
+    """(7,) step of an estimate that is solved again with edges up to 3 px away; and, where it is a long one,
+    why the estimate may be wrong: solved from there with near edges it does not come back.
+
+    Raises:
+        EstimationError: too few matches.
+    """
+    wider = yield from solution_steps(problem, estimate, WIDER_KERNEL_PX)
+    step = difference(estimate, wider.state)
+    if (np.abs(step) <= _SETTLED_STEP).all():
+        return step, ()
+    again = yield from _converged(problem, wider.state, None)
+    return step, unsettled_reasons(difference(estimate, again.state))
+
+
+def unsettled_reasons(step: FloatArray) -> tuple[str, ...]:
+    """Why an estimate may be wrong from which an optimum nearby lies by a step (7,)."""
+    if (np.abs(step) <= _SETTLED_STEP).all():
+        return ()
+    return (
+        "solved again with edges farther away, and from there with near ones, the estimate ends "
+        f"{np.degrees(np.linalg.norm(step[:3])):.2f} deg, {100.0 * np.linalg.norm(step[3:6]):.1f} cm and "
+        f"{1e3 * step[6]:+.1f} ms away: it has not settled on one set of edges",
+    )

@@ -35,8 +35,6 @@ MAX_MOTION_CHI2 = 33.0
 contradict."""
 _FLOOR = np.array([*np.radians([0.5] * 3), 0.005])
 """Added to the sigmas of that difference [rad, s]."""
-MAX_WIDER_KERNEL_STEP = np.array([*np.radians([0.1] * 3), 0.025, 0.025, 0.025, 0.015])
-"""(7,) farthest that an estimate may move where it is solved again with edges up to 3 px away [rad, m, s]."""
 MAX_FROM_GUESS_M = 0.35
 """Farthest that an estimate may lie from the guess: it is bound to it [m]."""
 
@@ -92,17 +90,6 @@ def contrast_of(own: float, around: Sequence[float], other: float) -> EdgeContra
     """
     spread = float(np.std(around)) + 1e-9
     return EdgeContrast(own, (own - float(np.mean(around))) / spread, own / max(max(around), 1e-9), other)
-
-
-def wider_kernel_reasons(step: FloatArray) -> tuple[str, ...]:
-    """Why an estimate may be wrong that moves by a step (7,) where edges farther away are met too."""
-    if (np.abs(step) <= MAX_WIDER_KERNEL_STEP).all():
-        return ()
-    return (
-        "solved again with edges farther away the estimate moves by "
-        f"{np.degrees(np.linalg.norm(step[:3])):.2f} deg, {100.0 * np.linalg.norm(step[3:6]):.1f} cm and "
-        f"{1e3 * step[6]:+.1f} ms: it has not settled on one set of edges",
-    )
 
 
 def edges_reasons(

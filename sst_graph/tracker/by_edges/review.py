@@ -22,18 +22,17 @@ from sst_graph.batch.by_edges.covariance import (
     half_sample_steps,
     outline_steps,
 )
+from sst_graph.batch.by_edges.optimum import farther_edges_steps
 from sst_graph.batch.by_edges.problem import KnownCalibration
 from sst_graph.batch.by_edges.reasons import (
     contrast_reasons,
     edge_contrast_steps,
     far_reasons,
-    wider_kernel_reasons,
 )
-from sst_graph.batch.by_edges.solution import WIDER_KERNEL_PX, solution_steps
 from sst_graph.covariance.shared_errors import spread_covariance
 from sst_graph.graph.matching import Tracks, edges_of
 from sst_graph.graph.outer_loop import JointProblem
-from sst_graph.graph.state import State, difference
+from sst_graph.graph.state import State
 from sst_graph.objects.tracks import ObjectId
 from sst_graph.sampling import evenly_spread
 from sst_graph.stepwise import Stepwise
@@ -90,12 +89,11 @@ def review_steps(
     few = evenly_spread(range(len(drive.scans)), _SCANS)
     edges = edges_of([drive.part(few)], problem.tracks.part(0, few), problem.config.graph)
     contrast = yield from edge_contrast_steps(edges, state, [], seed)
-    wider = yield from solution_steps(problem, state, WIDER_KERNEL_PX)
-    step = difference(state, wider.state)
+    step, unsettled = yield from farther_edges_steps(problem, state)
     halves, _ = yield from half_sample_steps(problem, state, [dict(objects)])
     outlines = yield from outline_steps(problem, state)
     farther = np.outer(step, step) + (0.0 if outlines is None else np.outer(outlines, outlines))
-    reasons = (*contrast_reasons(contrast), *wider_kernel_reasons(step), *few_edges(halves, outlines))
+    reasons = (*contrast_reasons(contrast), *unsettled, *few_edges(halves, outlines))
     return EdgeReview(reasons, spread_covariance(halves), np.asarray(farther))
 
 
