@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sst_graph.drive.preparation import ScanFeatures
-from sst_graph.odometry.lidar import MOVABLE_CLASSES
+from sst_graph.odometry.lidar import GROUND_CLASSES, TESTED_CLASSES
 from sst_graph.types import FloatArray, SemanticClass
 
 ObjectName = tuple[SemanticClass, int]
@@ -41,9 +41,7 @@ _SPEED_MPS = 0.6
 """Assumed speed of an object half way between the two shares [m/s]."""
 _MAX_SPEED_MPS = 30.0
 """Assumed speed of an object below the smaller share [m/s]."""
-TESTED_CLASSES = (*MOVABLE_CLASSES, SemanticClass.OBJECT)
-"""Classes of objects that may move. Odometry registers OBJECT, which is most of what stands still, too."""
-_RAISED = ~np.isin(np.arange(256), (SemanticClass.GROUND, SemanticClass.TERRAIN))
+_RAISED = ~np.isin(np.arange(256), GROUND_CLASSES)
 """Whether a label is anything but ground."""
 
 

@@ -17,7 +17,8 @@ from scipy.spatial.distance import cdist
 
 from sst_graph.drive.preparation import ScanFeatures
 from sst_graph.features.lidar_edges import Boundaries, Edge
-from sst_graph.objects.occupancy import TESTED_CLASSES, ObjectName
+from sst_graph.objects.occupancy import ObjectName
+from sst_graph.odometry.lidar import TESTED_CLASSES
 from sst_graph.types import FloatArray, SemanticClass
 
 _WINDOW_S = 0.35

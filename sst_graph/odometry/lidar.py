@@ -27,6 +27,10 @@ from sst_graph.types import FloatArray, RelativeMotion, Scan, SemanticClass
 
 MOVABLE_CLASSES = (SemanticClass.VEHICLE, SemanticClass.PERSON, SemanticClass.TWO_WHEELER)
 """Classes whose members may move by themselves."""
+TESTED_CLASSES = (*MOVABLE_CLASSES, SemanticClass.OBJECT)
+"""Classes of objects that may move. Odometry registers OBJECT, which is most of what stands still, too."""
+GROUND_CLASSES = (SemanticClass.GROUND, SemanticClass.TERRAIN)
+"""Classes of points on the ground."""
 _MOVABLE = np.isin(np.arange(256), MOVABLE_CLASSES)
 """Whether a label is one of them."""
 _MIN_VOXEL_M, _MAX_VOXEL_M = 0.1, 1.0

@@ -17,6 +17,7 @@ from streets import prepared_street, standing_street
 from sst_graph import CalibrationConfig, open_source
 from sst_graph.batch.causes import with_causes
 from sst_graph.cli import main
+from sst_graph.drive.geometric_labels import labelled_by_geometry
 from sst_graph.errors import ConfigError
 from sst_graph.odometry.sweep import (
     SWEEP_KEY,
@@ -32,6 +33,7 @@ from sst_graph.result import CalibrationResult, FrameId
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate, write_drive
 from sst_graph.sweep_timing import SweepTiming
 from sst_graph.types import Frame, Guess, Scan
+from studies.edges_streets import source_of
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 PARKED = DATA / "kitti_2011_09_26_parked"
@@ -312,6 +314,15 @@ def test_the_sweep_of_a_street(output: Any, sense: Any, kind: str) -> None:
     drive = simulate(replace(STREET, sweep_output=output, sweep_sense=sense))
     found = decide_sweep(drive.scan, len(drive))
     assert found.kind == kind, found.sentence
+
+
+@pytest.mark.slow
+def test_objects_of_no_class_are_used_where_they_stand() -> None:
+    """Vehicles ahead that geometry finds, not labels: at the same azimuths they move as a sweep would."""
+    drive = source_of("own-544")
+    assert isinstance(drive, SimulatedDrive)
+    found = decide_sweep(lambda k: labelled_by_geometry(drive.scan(k)), 20)
+    assert found.kind == "compensated", found.sentence
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 
 from sst_graph.factors.motion import cross
 from sst_graph.odometry.cloud import compensate_sweep, usable_points
-from sst_graph.odometry.lidar import MOVABLE_CLASSES, LidarOdometry, orthonormal
+from sst_graph.odometry.lidar import GROUND_CLASSES, TESTED_CLASSES, LidarOdometry, orthonormal
 from sst_graph.odometry.static_points import on_static_objects
 from sst_graph.sweep_timing import turned
 from sst_graph.types import FloatArray, Scan
@@ -190,15 +190,15 @@ class Window:
             points @ pose[:3, :3].T + pose[:3, 3]
             for (points, _), pose in zip(parts, self._poses, strict=True)
         ]
-        movable = [np.isin(classes, MOVABLE_CLASSES) for _, classes in parts]
-        for k, (points, _) in enumerate(parts):
-            # An object is static if it is where it is in the scan half a window away.
-            other = k + len(scans) // 2 if k < len(scans) // 2 else k - len(scans) // 2
-            kept = ~movable[k]
-            static = on_static_objects(
-                world[k][movable[k]], world[other][movable[other]], _STATIC_M, _MISSING_M
-            )
-            kept[np.flatnonzero(movable[k])[static]] = True
+        raised = [np.isin(classes, GROUND_CLASSES, invert=True) for _, classes in parts]
+        for k, (points, classes) in enumerate(parts):
+            # An object is static if it is where it is in a scan a third of the window earlier or later.
+            kept = np.isin(classes, TESTED_CLASSES, invert=True)
+            tested = np.flatnonzero(~kept)
+            for other in (k - len(scans) // 3, k + len(scans) // 3):
+                if 0 <= other < len(scans):
+                    there = world[other][raised[other]]
+                    kept[tested] |= on_static_objects(world[k][tested], there, _STATIC_M, _MISSING_M)
             found.append(points[kept])
         return found
 
