@@ -13,7 +13,7 @@ from sst_graph.batch.by_edges.covariance import edges_covariance
 from sst_graph.batch.by_edges.halves import halves_reasons
 from sst_graph.batch.by_edges.lens import lens_steps
 from sst_graph.batch.by_edges.optimum import RESTARTS, best_optimum_steps, refined_steps, starts_steps
-from sst_graph.batch.by_edges.problem import LabelEstimate, edges_problem, motion_alone
+from sst_graph.batch.by_edges.problem import LabelEstimate, checking_motion, edges_problem, motion_alone
 from sst_graph.batch.by_edges.reasons import (
     EdgeContrast,
     edge_contrast,
@@ -79,7 +79,8 @@ def edges_method(
     contrast = edge_contrast(
         problem.subset_edges, solution.state, [one.state for _, one in candidates], config.seed
     )
-    reasons = edges_reasons(solution, contrast, motion, covariance, problem.centre)
+    checking = checking_motion(motion, config)
+    reasons = edges_reasons(solution, contrast, checking, covariance, problem.centre)
     reasons += wider_kernel_reasons(wider_step)
     if config.check_contradictions:
         reasons += halves_reasons(problem.whole, solution.state, covariance)
