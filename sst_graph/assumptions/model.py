@@ -105,6 +105,8 @@ class Assumption:
         by_edges: whether edges test it, which estimate all such parameters together
             (:mod:`sst_graph.batch.by_edges.lens`).
         of_lidar: whether it is about the LiDAR: all cameras on it then have its error in common.
+        turns_motion: whether a value other than zero turns or delays the calibration by motion alone, which
+            takes it for zero: a principal point 10 px away turns a camera of 700 px by 0.8 deg.
     """
 
     name: str
@@ -119,6 +121,7 @@ class Assumption:
     by_matches: bool = True
     by_edges: bool = False
     of_lidar: bool = False
+    turns_motion: bool = False
 
     def contradicted_by(self, value: float, sigma: float, threshold: float) -> bool:
         """Whether an estimate with its deviation is so many deviations from zero.

@@ -48,6 +48,7 @@ CX = Assumption(
     # A judgement: pictures are cropped, and matrices taken from another day or camera, about that often.
     prevalence=0.1,
     by_edges=True,
+    turns_motion=True,
 )
 CY = replace(CX, name="cy", effect=_down, violation="the pictures lie beside the principal point cy")
 

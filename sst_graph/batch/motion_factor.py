@@ -58,7 +58,8 @@ def with_motion(
     """The estimate with the motion in its graph, where the settings allow it and the two agree.
 
     With ``use_motion=auto`` the motion is used where the labels determine all unknowns by themselves and the
-    points of a scan share one time: a rolling sweep is compensated by the very motion.
+    points of a scan share one time: a rolling sweep is compensated by the very motion. Nor is it used where a
+    parameter is estimated that the motion takes for zero, for it would hold it there.
 
     Args:
         labels: what the labels alone say.
@@ -70,8 +71,10 @@ def with_motion(
     if config.use_motion == "auto":
         weak = weak_directions(labels.covariance[:7, :7], state.cTl, config.observability)
         rolling = any(scan.offsets_s.any() for drive in problem.drives for scan in drive.scans)
-        if weak or rolling:
+        turning = config.assumptions.turning_motion
+        if weak or rolling or turning:
             why = "the labels alone leave directions open" if weak else "the scans are rolling sweeps"
+            why = f"the motion takes {' and '.join(turning)} for zero" if turning else why
             return WithMotion(labels, diagnostics={"left_out": why})
     return fuse_motion(problem, labels, stretches)
 

@@ -98,6 +98,11 @@ class AssumptionConfig(AssumptionSigmas):
         """Assumptions whose parameters are variables, with the deviation of each beforehand."""
         return named_sigmas(self.estimate)
 
+    @property
+    def turning_motion(self) -> tuple[str, ...]:
+        """Those of the estimated parameters that turn or delay the calibration by motion alone."""
+        return tuple(name for name, _ in self.estimated if ASSUMPTIONS[name].turns_motion)
+
 
 @dataclass(frozen=True)
 class Considered:

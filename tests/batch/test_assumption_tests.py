@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 
 import gtsam
@@ -18,15 +18,16 @@ from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.config import with_overrides
 from sst_graph.covariance.cluster_robust import robust_covariance
 from sst_graph.covariance.considered import BUDGET, AssumptionConfig
+from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import ConfigError
 from sst_graph.experiments.assumptions import CLEAN, AssumptionTableConfig, Run, table
-from sst_graph.experiments.wrong_drives import with_focal
+from sst_graph.experiments.wrong_drives import with_focal, with_principal_point
 from sst_graph.graph.outer_loop import solve_joint
 from sst_graph.graph.state import State, nuisance_key
 from sst_graph.inspect.budget_text import budget_lines
 from sst_graph.result import CalibrationResult
-from sst_graph.types import Guess
+from sst_graph.types import CameraImage, Guess
 
 CONFIG = with_overrides(
     CalibrationConfig(), ["search.enabled=false", "use_motion=never", "check_contradictions=false"]
@@ -87,6 +88,40 @@ def test_a_distorted_picture_is_named_and_can_be_estimated(k1: float) -> None:
     # What the labels say of k1 where nothing is distorted is in both.
     rotation_deg, translation_m = difference(result, calibrated(prepared(), config))
     assert rotation_deg < 0.1 and translation_m < 0.015
+
+
+def with_faster_images(drive: KeptDrive) -> KeptDrive:
+    """The images' clock runs 1.5 % too fast, from the first image on."""
+    first = next(frame.image.stamp_ns for frame in drive.frames if frame.image is not None)
+
+    def change(image: CameraImage) -> CameraImage:
+        return dataclasses.replace(image, stamp_ns=image.stamp_ns + (image.stamp_ns - first) * 15 // 1000)
+
+    return drive.with_images(change)
+
+
+def with_cropped_images(drive: KeptDrive) -> KeptDrive:
+    return with_principal_point(drive, 0.0, 10.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "change", "true"),
+    [("cy", with_cropped_images, 10.0), ("skew", with_faster_images, -0.015)],
+)
+def test_motion_does_not_hold_what_is_estimated(
+    name: str, change: Callable[[KeptDrive], KeptDrive], true: float
+) -> None:
+    config = with_overrides(CalibrationConfig(), ["search.enabled=false", "check_contradictions=false"])
+    config = dataclasses.replace(config, assumptions=AssumptionConfig(estimate=(name,)))
+    result = calibrated(prepare_drives([change(crowded_street())], config), config)
+    found = result.diagnostics["estimated"][name]
+    assert found["value"] == pytest.approx(true, abs=3.0 * found["sigma"])
+    truth = crowded_street().truth
+    assert truth is not None and truth.time_offset_s is not None
+    step = gtsam.Pose3.Logmap(result.T_camera_lidar.between(truth.cTl))
+    error = np.append(step, truth.time_offset_s - result.time_offset_s)
+    assert (np.abs(error) < 3.0 * np.sqrt(np.diag(result.covariance))).all()
 
 
 def test_with_every_parameter_estimated_nothing_is_left_to_consider() -> None:

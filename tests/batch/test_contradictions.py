@@ -17,10 +17,11 @@ from streets import TRACKED_STREET
 from sst_graph import CalibrationConfig, open_source
 from sst_graph.batch.calibrate import calibrate_prepared, prepare_drives
 from sst_graph.batch.contradictions import find_contradictions
-from sst_graph.batch.motion_factor import MAX_DISAGREEMENT_CHI2, fuse_motion
+from sst_graph.batch.motion_factor import MAX_DISAGREEMENT_CHI2, fuse_motion, with_motion
 from sst_graph.batch.part_solver import Part, PartSolver, SolvedPart
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.config import with_overrides
+from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.covariance.contradiction import PartEstimate
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import Drive
@@ -273,6 +274,18 @@ def test_motion_that_contradicts_a_stretch_is_left_out() -> None:
         assert (found.estimate is labels) is not used
         assert bool(found.remarks) is not used
     assert "frames 4 to 7" in found.remarks[0]
+
+
+def test_motion_is_left_out_where_what_it_takes_for_zero_is_estimated() -> None:
+    parts = parts_of(prepared())
+    joint = replace(parts.problem.joint(), config=JointConfig())
+    labels = JointEstimate.of(solve_joint(joint, parts.reference, (5.0, 3.0)), parts.problem.objects)
+    labels = replace(labels, covariance=np.diag(np.array([0.001] * 3 + [0.01] * 3 + [0.003]) ** 2))
+    for estimate, used in (((), True), (("k1",), True), (("cx",), False), (("k1", "skew"), False)):
+        config = replace(CONFIG, method="joint", assumptions=AssumptionConfig(estimate=estimate))
+        found = with_motion(replace(parts.problem, config=config), labels, [])
+        assert bool(found.diagnostics.get("fused")) is used and not found.reasons
+        assert (found.estimate is labels) is not used
 
 
 def test_motion_that_does_not_fit_itself_contradicts_nothing() -> None:

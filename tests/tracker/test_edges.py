@@ -348,16 +348,14 @@ def tracked(source: Source, initial: gtsam.Pose3) -> tuple[Tracker, TrackUpdate]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "status"), [("own-504", "ok"), ("own-507", "ok"), ("third-901", "contradicted")]
-)
-def test_a_street_without_labels(name: str, status: str) -> None:
-    """The last moves by 3.5 cm where edges farther away are met: right, and not trusted."""
+@pytest.mark.parametrize("name", ["own-504", "own-507", "third-901"])
+def test_a_street_without_labels(name: str) -> None:
+    """The last moves by 3.5 cm where edges farther away are met, and comes back."""
     street = source_of(name)
     truth = street.truth
     assert truth is not None and truth.time_offset_s is not None
     _, update = tracked(street, truth.cTl.retract(start_step(name)))
-    assert update.status == status
+    assert update.status == "ok"
     step = np.append(
         truth.cTl.localCoordinates(update.T_camera_lidar), update.time_offset_s - truth.time_offset_s
     )

@@ -19,7 +19,7 @@ from sst_graph.batch.by_edges.optimum import (
     refined_steps,
     starts_steps,
 )
-from sst_graph.batch.by_edges.problem import LabelEstimate, edges_problem, motion_alone
+from sst_graph.batch.by_edges.problem import LabelEstimate, checking_motion, edges_problem, motion_alone
 from sst_graph.batch.by_edges.reasons import (
     EdgeContrast,
     edge_contrast,
@@ -81,7 +81,8 @@ def edges_method(
     contrast = edge_contrast(
         problem.subset_edges, solution.state, [one.state for _, one in candidates], config.seed
     )
-    reasons = edges_reasons(solution, contrast, motion, covariance, problem.centre)
+    checking = checking_motion(motion, config)
+    reasons = edges_reasons(solution, contrast, checking, covariance, problem.centre)
     reasons += unsettled
     if config.check_contradictions:
         reasons += halves_reasons(problem.whole, solution.state, covariance)

@@ -202,13 +202,20 @@ def edges_problem(
     offset_known = labels.state is None and motion is not None and _tells_offset(motion)
     centre = State(pose, (region.time_offsets_s[0] if offset_known else guess.time_offset_s,))
     guessed = labels.state is None and guess.cTl is not None
-    known = _prior(centre, None if labels.has_motion else motion, guessed)
+    checking = None if labels.has_motion else checking_motion(motion, calibration.config)
+    known = _prior(centre, checking, guessed)
     whole = replace(joint, centre=centre, prior=known.factor())
     scans = [_some_scans(drive, guess.time_offset_s) for drive in drives]
     parts = [drive.part(own) for drive, own in zip(drives, scans, strict=True)]
     tracks = [joint.tracks.part(number, own) for number, own in enumerate(scans)]
     some = replace(whole, drives=parts, tracks=Tracks.joined(tracks))
     return EdgesProblem(whole, some, replace(region, cTl=pose), centre, known)
+
+
+def checking_motion(motion: MotionSolution | None, config: CalibrationConfig) -> MotionSolution | None:
+    """What motion says, where the result should agree with it: not where a parameter is estimated that motion
+    takes for zero, and that turns or delays what it says."""
+    return None if config.assumptions.turning_motion else motion
 
 
 def _some_scans(drive: Drive, time_offset_s: float) -> list[int]:

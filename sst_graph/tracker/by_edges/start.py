@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from sst_graph.batch.by_edges.optimum import RESTARTS, best_optimum_steps, refined_steps, starts_steps
-from sst_graph.batch.by_edges.problem import LabelEstimate, edges_problem, motion_alone
+from sst_graph.batch.by_edges.problem import LabelEstimate, checking_motion, edges_problem, motion_alone
 from sst_graph.batch.by_edges.reasons import edge_contrast_steps, edges_reasons
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.errors import EstimationError
@@ -49,7 +49,8 @@ def first_edge_estimate_steps(
     state = solution.state
     others = [one.state for _, one in candidates]
     contrast = yield from edge_contrast_steps(problem.subset_edges, state, others, calibration.seed)
-    reasons = edges_reasons(solution, contrast, motion, np.diag(_START_SIGMAS**2), problem.centre)
+    checking = checking_motion(motion, calibration)
+    reasons = edges_reasons(solution, contrast, checking, np.diag(_START_SIGMAS**2), problem.centre)
     names = [name for name, _ in calibration.assumptions.estimated]
     point = Point.of_state(state, calibration.classes, names)
     if stretch.at_end:

@@ -19,7 +19,7 @@ from sst_graph.batch.by_edges.covariance import SAMPLES
 from sst_graph.batch.by_edges.lens import MATTERS_SIGMAS, LensTest, lens_steps
 from sst_graph.batch.by_edges.optimum import START_KERNELS_PX
 from sst_graph.batch.by_edges.parts import thinned
-from sst_graph.batch.by_edges.problem import LabelEstimate, edges_problem
+from sst_graph.batch.by_edges.problem import LabelEstimate, edges_problem, motion_alone
 from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.batch.problem import CalibrationProblem
@@ -59,6 +59,19 @@ def test_the_right_lens_is_not_contradicted(drive: Drive) -> None:
     assert {each.assumption.name for each in found.findings} == {"focal", "cx", "cy", "k1"}
     assert not found.contradicted and found.reasons(COVARIANCE) == () == found.remarks(COVARIANCE)
     assert not found.covariance.any()
+
+
+def test_motion_does_not_hold_a_principal_point_that_is_estimated(drive: Drive) -> None:
+    truth = simulated(STREET).truth
+    guess = Guess(truth.cTl, truth.time_offset_s)
+    for estimate, held in (((), True), (("k1",), True), (("cy",), False)):
+        config = CalibrationConfig(method="edges", assumptions=AssumptionConfig(estimate=estimate))
+        problem = CalibrationProblem.of([drive], guess, config)
+        motion = motion_alone([drive], guess, config, None)
+        assert motion is not None
+        known = edges_problem(problem, motion, LabelEstimate()).known
+        pitch_deg = np.degrees(np.sqrt(known.covariance[1, 1]))
+        assert bool(pitch_deg < 5.0) is held
 
 
 def test_a_wrong_principal_point_is_named_with_its_size(drive: Drive) -> None:
