@@ -318,24 +318,24 @@ class DriveEdges:
             return None
         paired, group_pairs = at.paired, at.group_pairs
         # 2. Match them.
-        scene = at.motions.scene(drive, paired.repeated(group_pairs))
-        deviation = deviation_of(state.nuisances, scene)
+        deviation = None
+        if any(state.nuisances.values()):
+            scene = at.motions.scene(drive, paired.repeated(group_pairs))
+            deviation = deviation_of(state.nuisances, scene)
         found = match_edges(paired, state.cTl, time_offset_s, kernel, self.config, deviation)
         if len(found.index) == 0:
             return None
         if at.shares is not None and not (at.shares == 1.0).all():
             weights = at.shares[found.index] * found.alignment.weights
             found = replace(found, alignment=replace(found.alignment, weights=weights))
-        firsts = paired.bounds[:-1]
         return DriveMatches(
             self,
             at.pairs,
             at.motions,
             found,
+            at.groups,
             np.array(group_pairs),
-            [self.classes[g] for g in at.groups],
-            at.index[found.index],
-            found.index - np.repeat(firsts, np.diff(found.bounds)),
+            at.index.take(found.index),
             state.cTl,
             time_offset_s,
         )
@@ -390,23 +390,23 @@ class DriveEdges:
         """The points of groups with their pairs' images, and which of all points they are."""
         drive, biases = self.drive, state.biases_of(self.number)
         spans = [(int(self.bounds[g]), int(self.bounds[g + 1])) for g, _ in groups]
-        bounds = np.cumsum([0, *(b - a for a, b in spans)])
+        counts = [b - a for a, b in spans]
         whole = [g for g, _ in groups] == list(range(len(self.scans)))
         index = np.concatenate([np.arange(a, b) for a, b in spans])
         points = self.points if whole else self.points.take(index)
         velocities = self.velocities if whole or self.velocities is None else self.velocities[index]
         if velocities is not None and not velocities.any():
             velocities = None
-        classes = [self.classes[g] for g, _ in groups]
-        base_taus_s = np.array([pairs[p].base_tau_s for _, p in groups])
+        classes, chosen = [self.classes[g] for g, _ in groups], [p for _, p in groups]
+        base_taus_s = np.array([pairs[p].base_tau_s for p in chosen])
         paired = PairedEdges(
             drive.camera,
             points,
             self.owners if whole else self._owners(groups, index),
-            bounds,
-            [drive.images[pairs[p].image].contours[c] for (_, p), c in zip(groups, classes, strict=True)],
-            [motions.of_images[p] for _, p in groups],
-            np.repeat(base_taus_s, np.diff(bounds)) - points.offsets_s,
+            np.cumsum([0, *counts]),
+            [drive.images[pairs[p].image].contours[c] for p, c in zip(chosen, classes, strict=True)],
+            motions.of_images(chosen if len(set(chosen)) > 1 else chosen[0]),
+            base_taus_s.repeat(counts) - points.offsets_s,
             np.array([biases.get(c, 0.0) for c in classes]),
             velocities,
         )
@@ -425,13 +425,14 @@ class _Motions:
     """The motion around the images of pairs.
 
     Attributes:
-        of_images: the camera's.
+        c_twists, c_accelerations: (p, 6) the camera's [rad/s, m/s].
         l_twists: the LiDAR's, or None without odometry.
         measured: (p, 6) the LiDAR's as measured; zeros without odometry [rad/s, m/s].
         since_s: (p,) stamps of the images minus that of the drive's first [s].
     """
 
-    of_images: Sequence[CameraTwist]
+    c_twists: FloatArray
+    c_accelerations: FloatArray
     l_twists: TwistSamples | None
     measured: FloatArray
     since_s: FloatArray
@@ -446,15 +447,18 @@ class _Motions:
         since_s = np.array([stamp - origin_ns for stamp in stamps]) * 1e-9
         l_twists = edges.tracks.at_all(number, [stamp + shift_ns for stamp in stamps])
         if l_twists is None:
-            rest = CameraTwist(np.zeros(6), np.zeros(6))
-            return cls([rest] * len(pairs), None, np.zeros((len(pairs), 6)), since_s)
+            rest = np.zeros((len(pairs), 6))
+            return cls(rest, rest, None, rest, since_s)
         measured = l_twists.twists
         l_twists = moved_twists(
             l_twists, state.nuisances, Scene(drive.camera, measured, 0.0, drive.scan_period_s)
         )
         Ad = np.asarray(state.cTl.AdjointMap())
-        rows = zip(l_twists.twists @ Ad.T, l_twists.accelerations @ Ad.T, strict=True)
-        return cls([CameraTwist(*row) for row in rows], l_twists, measured, since_s)
+        return cls(l_twists.twists @ Ad.T, l_twists.accelerations @ Ad.T, l_twists, measured, since_s)
+
+    def of_images(self, pairs: int | Sequence[int]) -> CameraTwist:
+        """The camera's around the image of one pair, or by rows (g, 6) around those of some."""
+        return CameraTwist(self.c_twists[pairs], self.c_accelerations[pairs])
 
     def scene(self, drive: Drive, of: IntArray | int) -> Scene:
         """What assumptions depend on, of some of the pairs."""
@@ -494,9 +498,9 @@ class DriveMatches:
         pairs: all pairs, also those without a match.
         motions: around their images.
         found: the matches, group by group.
-        group_pairs, group_classes: pair and class of each group.
-        points: (m,) which of the drive's points each match is, and
-        places: (m,) which of the points of its scan and class each match is.
+        groups: which of the drive's groups each is, and
+        group_pairs: its pair.
+        points: (m,) which of the drive's points each match is.
         cTl, time_offset_s: extrinsic and time offset that the matches were made at.
     """
 
@@ -504,10 +508,9 @@ class DriveMatches:
     pairs: Sequence[Pair]
     motions: _Motions
     found: EdgeMatches
+    groups: Sequence[int]
     group_pairs: IntArray
-    group_classes: Sequence[SemanticClass]
     points: IntArray
-    places: IntArray
     cTl: gtsam.Pose3
     time_offset_s: float
 
@@ -530,6 +533,16 @@ class DriveMatches:
         return np.diff(self.found.bounds)
 
     @cached_property
+    def group_classes(self) -> list[SemanticClass]:
+        """Class of each group."""
+        return [self.edges.classes[g] for g in self.groups]
+
+    @cached_property
+    def places(self) -> IntArray:
+        """(m,) which of the points of its scan and class each match is."""
+        return self.points - self.edges.bounds[list(self.groups)].repeat(self.counts)
+
+    @cached_property
     def pair_of(self) -> IntArray:
         """(m,) number of each match's pair."""
         return np.repeat(self.group_pairs, self.counts)
@@ -539,10 +552,10 @@ class DriveMatches:
         """Numbers of the pairs that have matches."""
         return list(np.unique(self.pair_of).tolist())
 
-    @cached_property
+    @property
     def c_twists(self) -> FloatArray:
         """(p, 6) of the camera at the image of each pair [rad/s, m/s]."""
-        return np.stack([motion.c_twist for motion in self.motions.of_images])
+        return self.motions.c_twists
 
     @cached_property
     def tracks(self) -> IntArray | None:
@@ -598,7 +611,7 @@ class DriveMatches:
         return [self._pair(p, own) for p, own in groups.items()]
 
     def _pair(self, p: int, groups: Mapping[SemanticClass, tuple[slice, int]]) -> PairMatches:
-        objects, motion = self.edges.points.objects, self.motions.of_images[p]
+        objects, motion = self.edges.points.objects, self.motions.of_images(p)
         l_twists, tracks = self.motions.l_twists, self.tracks
         return PairMatches(
             self.number,
