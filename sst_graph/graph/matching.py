@@ -362,18 +362,34 @@ class DriveEdges:
         ]
         if not groups:
             return None
-        # 2. The motion around the images.
-        motions = _Motions.of(self, pairs, state)
-        # 3. The points, without the objects whose weight is 0.
-        paired, index = self._paired(groups, pairs, motions, state)
-        shares = None
-        if self.unknown_mps is not None:
-            taus_s = time_offset_s + paired.repeated([pairs[p].base_tau_s for _, p in groups])
-            shares = dynamic_object_weights(self.unknown_mps[index], taus_s, DYNAMIC_REACH_M)
-            if not shares.all():
-                kept = np.flatnonzero(shares)
-                paired, index, shares = paired.take(kept), index[kept], shares[kept]
         chosen, group_pairs = [g for g, _ in groups], [p for _, p in groups]
+        # 2. Their points, without the objects whose weight is 0.
+        spans = [(int(self.bounds[g]), int(self.bounds[g + 1])) for g in chosen]
+        index, bounds = (
+            np.concatenate([np.arange(*span) for span in spans]),
+            np.cumsum([0, *(b - a for a, b in spans)]),
+        )
+        base_taus_s, shares = np.array([pairs[p].base_tau_s for p in group_pairs]), None
+        if self.unknown_mps is not None:
+            taus_s = time_offset_s + base_taus_s.repeat(np.diff(bounds))
+            shares = dynamic_object_weights(self.unknown_mps.take(index), taus_s, DYNAMIC_REACH_M)
+            kept = np.flatnonzero(shares)
+            index, bounds, shares = index.take(kept), np.searchsorted(kept, bounds), shares.take(kept)
+        points = self.points if np.array_equal(index, np.arange(len(self))) else self.points.take(index)
+        # 3. The images that they are compared with, and the motion around these.
+        motions, biases = _Motions.of(self, pairs, state), state.biases_of(self.number)
+        classes = [self.classes[g] for g in chosen]
+        paired = PairedEdges(
+            drive.camera,
+            points,
+            self._owners(chosen, index, bounds),
+            bounds,
+            [drive.images[pairs[p].image].contours[c] for p, c in zip(group_pairs, classes, strict=True)],
+            motions.of_images(group_pairs if len(set(group_pairs)) > 1 else group_pairs[0]),
+            base_taus_s.repeat(np.diff(bounds)) - points.offsets_s,
+            np.array([biases.get(c, 0.0) for c in classes]),
+            self._velocities(index),
+        )
         return _PairedAtState(pairs, chosen, group_pairs, motions, paired, index, shares)
 
     def pairs(self, time_offset_s: float) -> list[Pair]:
@@ -384,40 +400,17 @@ class DriveEdges:
             return pair_every_image(*stamps, time_offset_s, EVERY_IMAGE_REACH * drive.lidar_period_s)
         return pair_by_time(*stamps, time_offset_s, drive.image_period_s)
 
-    def _paired(
-        self, groups: Sequence[tuple[int, int]], pairs: Sequence[Pair], motions: _Motions, state: State
-    ) -> tuple[PairedEdges, IntArray]:
-        """The points of groups with their pairs' images, and which of all points they are."""
-        drive, biases = self.drive, state.biases_of(self.number)
-        spans = [(int(self.bounds[g]), int(self.bounds[g + 1])) for g, _ in groups]
-        counts = [b - a for a, b in spans]
-        whole = [g for g, _ in groups] == list(range(len(self.scans)))
-        index = np.concatenate([np.arange(a, b) for a, b in spans])
-        points = self.points if whole else self.points.take(index)
-        velocities = self.velocities if whole or self.velocities is None else self.velocities[index]
-        if velocities is not None and not velocities.any():
-            velocities = None
-        classes, chosen = [self.classes[g] for g, _ in groups], [p for _, p in groups]
-        base_taus_s = np.array([pairs[p].base_tau_s for p in chosen])
-        paired = PairedEdges(
-            drive.camera,
-            points,
-            self.owners if whole else self._owners(groups, index),
-            np.cumsum([0, *counts]),
-            [drive.images[pairs[p].image].contours[c] for p, c in zip(chosen, classes, strict=True)],
-            motions.of_images(chosen if len(set(chosen)) > 1 else chosen[0]),
-            base_taus_s.repeat(counts) - points.offsets_s,
-            np.array([biases.get(c, 0.0) for c in classes]),
-            velocities,
-        )
-        return paired, index
-
-    def _owners(self, groups: Sequence[tuple[int, int]], index: IntArray) -> IntArray:
+    def _owners(self, chosen: Sequence[int], index: IntArray, bounds: IntArray) -> IntArray:
         """(n,) numbers of the objects of some points; an object in two images counts as two."""
-        chosen = np.array([g for g, _ in groups])
-        nth = np.arange(len(chosen)) - np.searchsorted(chosen, chosen)
-        counts = np.diff(self.bounds)[chosen]
-        return np.asarray(self.owners[index] + np.repeat(nth, counts) * (int(self.owners.max()) + 1))
+        owners, nth = self.owners.take(index), np.arange(len(chosen)) - np.searchsorted(chosen, chosen)
+        if not nth.any():
+            return owners
+        return np.asarray(owners + nth.repeat(np.diff(bounds)) * (int(self.owners.max()) + 1))
+
+    def _velocities(self, index: IntArray) -> FloatArray | None:
+        """(n, 3) of the objects of some points; None where all are static."""
+        velocities = None if self.velocities is None else self.velocities.take(index, axis=0)
+        return None if velocities is None or not velocities.any() else velocities
 
 
 @dataclass(frozen=True)
