@@ -448,7 +448,8 @@ def _contours_or_gradients(
             distances[index] = found.distances
         else:
             pictures = [each for each, _ in groups if isinstance(each, PictureGradients)]
-            outward = ways[index] / np.maximum(np.linalg.norm(ways[index], axis=1), 1e-9)[:, None]
+            right, down = ways[index].T
+            outward = ways[index] / np.maximum(np.sqrt(right**2 + down**2), 1e-9)[:, None]
             # The window is where the residual is 0.
             bias = biases[index]
             moved = own + bias[:, None] * outward

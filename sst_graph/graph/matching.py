@@ -573,12 +573,10 @@ class DriveMatches:
         """(drive, class, track) of every object with a mask bias of its own."""
         if self.tracks is None:
             return set()
-        spans = pairwise(self.found.bounds.tolist())
-        return {
-            (self.number, c, track)
-            for c, (a, b) in zip(self.group_classes, spans, strict=True)
-            for track in np.unique(self.tracks[a:b]).tolist()
-        }
+        tracks, first = np.unique(self.tracks, return_index=True)
+        groups = np.searchsorted(self.found.bounds, first, side="right") - 1
+        found = zip(groups.tolist(), tracks.tolist(), strict=True)
+        return {(self.number, self.group_classes[g], track) for g, track in found}
 
     @cached_property
     def terms(self) -> dict[str, FloatArray]:
