@@ -430,34 +430,38 @@ def _contours_or_gradients(
     Returns:
         The contours, and (n,) the share of its full weight that each has.
     """
-    n, biases = len(uvs), paired.repeated(paired.biases_px)
-    distances, shares, valid = np.zeros(n), np.ones(n), np.zeros(n, np.bool_)
-    normals, feet = np.tile([1.0, 0.0], (n, 1)), uvs.copy()
-    masked, unmasked = np.flatnonzero(paired.by_masks), np.flatnonzero(~paired.by_masks)
-    for index in (masked, unmasked):
-        some = paired.take(index) if len(index) < n else paired
+    n, found = len(uvs), []
+    if n == 0:
+        return nearest_contours([], [], uvs), np.zeros(0)
+    for masks in (True, False):
+        index = np.flatnonzero(paired.by_masks == masks)
+        if len(index) == 0:
+            continue
+        some, own, way = paired, uvs, ways
+        if len(index) < n:
+            some, own, way = paired.take(index), uvs.take(index, axis=0), ways.take(index, axis=0)
         groups = [
             (each, span) for each, span in zip(some.contours, some.spans, strict=True) if span[1] > span[0]
         ]
-        if not groups:
-            continue
-        spans, own = [span for _, span in groups], uvs[index]
-        if index is masked:
+        spans = [span for _, span in groups]
+        if masks:
             maps = [each for each, _ in groups if isinstance(each, ContourMap)]
-            found = nearest_contours(maps, spans, own)
-            distances[index] = found.distances
-        else:
-            pictures = [each for each, _ in groups if isinstance(each, PictureGradients)]
-            right, down = ways[index].T
-            outward = ways[index] / np.maximum(np.sqrt(right**2 + down**2), 1e-9)[:, None]
-            # The window is where the residual is 0.
-            bias = biases[index]
-            moved = own + bias[:, None] * outward
-            edges = nearest_edges(pictures, spans, moved, outward, kernel.scale, place)
-            found, shares[index] = edges, np.maximum(edges.shares, 1e-3)
-            distances[index] = edges.distances - bias
-        normals[index], feet[index], valid[index] = found.normals, found.feet, found.valid
-    return ContourFeet(distances, normals, feet, valid), shares
+            found.append((index, nearest_contours(maps, spans, own), np.ones(len(index))))
+            continue
+        pictures = [each for each, _ in groups if isinstance(each, PictureGradients)]
+        right, down = way.T
+        outward = way / np.maximum(np.sqrt(right**2 + down**2), 1e-9)[:, None]
+        # The window is where the residual is 0.
+        bias = some.repeated(some.biases_px)
+        edges = nearest_edges(pictures, spans, own + bias[:, None] * outward, outward, kernel.scale, place)
+        feet = ContourFeet(edges.distances - bias, edges.normals, edges.feet, edges.valid)
+        found.append((index, feet, np.maximum(edges.shares, 1e-3)))
+    if len(found) == 1:
+        return found[0][1:]
+    order = np.argsort(np.concatenate([index for index, _, _ in found]))
+    parts = [(feet.distances, feet.normals, feet.feet, feet.valid, shares) for _, feet, shares in found]
+    *whole, shares = (np.concatenate(each).take(order, axis=0) for each in zip(*parts, strict=True))
+    return ContourFeet(*whole), shares
 
 
 def _effect(deviation: PointDeviation, paired: PairedEdges, uvs: FloatArray) -> Effect:
