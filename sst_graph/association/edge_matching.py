@@ -402,6 +402,7 @@ def match_edges(
     shares = np.ones(len(index)) if shares is None else shares[near][on]
     weights = weights * shares
     bounds = np.searchsorted(index, paired.bounds)
+    velocities = None if paired.velocities is None else paired.velocities.take(index, axis=0)
     alignment = Alignment(
         camera=paired.camera,
         lPs=paired.points.lPs.take(index, axis=0),
@@ -412,7 +413,7 @@ def match_edges(
         kernel=kernel,
         c_acceleration=paired.accelerations(np.diff(bounds)),
         weights=weights,
-        l_velocities=None if paired.velocities is None else paired.velocities.take(index, axis=0),
+        l_velocities=velocities if velocities is not None and velocities.any() else None,
         stretches=enlarged,
     )
     return EdgeMatches(index, sides, alignment, bounds, some.counts, shares, level_px)
