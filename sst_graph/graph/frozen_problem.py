@@ -362,10 +362,10 @@ class FrozenProblem:
             cells = (lift[frames.cell_spans] @ cells.T[:, :, None])[:, :, 0].T
         # 3. They belong to the extrinsic, the time offset and the parameters, to the twists,
         places, columns = frames.places, frames.columns
-        shared, twist = [*range(7), *range(13, 13 + len(frames.terms))], slice(7, 13)
-        of_shared = products[:, :, shared]
+        shared, twist = np.array([*range(7), *range(13, 13 + len(frames.terms))]), slice(7, 13)
+        of_shared = products.take(shared, axis=2)
         total = of_shared.sum(axis=0)
-        system.H[columns[:, None], columns] += total[shared]
+        system.H[columns[:, None], columns] += total.take(shared, axis=0)
         system.g[columns] += total[-1]
         system.H_twists[places] += products[:, twist, twist]
         system.g_twists[places] += products[:, twist, -1]
@@ -374,9 +374,10 @@ class FrozenProblem:
         bias, image_of = frames.biases[frames.cells], frames.images[frames.cells]
         by_bias = np.zeros((len(system.g), len(cells)))
         np.add.at(by_bias, bias, cells.T)
-        system.H[columns] += by_bias[:, shared].T
-        system.H[:, columns] += by_bias[:, shared]
-        np.fill_diagonal(system.H, system.H.diagonal() + by_bias[:, -2])
+        with_shared = by_bias.take(shared, axis=1)
+        system.H[columns] += with_shared.T
+        system.H[:, columns] += with_shared
+        np.einsum("ii->i", system.H)[...] += by_bias[:, -2]
         system.g[...] += by_bias[:, -1]
         system.H_mixed[image_of, :, bias] += cells[twist].T
         return 0.5 * (float(rows[-1] @ rows[-1]) + constant)
