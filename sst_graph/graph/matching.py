@@ -365,10 +365,8 @@ class DriveEdges:
         chosen, group_pairs = [g for g, _ in groups], [p for _, p in groups]
         # 2. Their points, without the objects whose weight is 0.
         spans = [(int(self.bounds[g]), int(self.bounds[g + 1])) for g in chosen]
-        index, bounds = (
-            np.concatenate([np.arange(*span) for span in spans]),
-            np.cumsum([0, *(b - a for a, b in spans)]),
-        )
+        index = np.concatenate([np.arange(*span) for span in spans])
+        bounds = np.cumsum([0, *(b - a for a, b in spans)])
         base_taus_s, shares = np.array([pairs[p].base_tau_s for p in group_pairs]), None
         if self.unknown_mps is not None:
             taus_s = time_offset_s + base_taus_s.repeat(np.diff(bounds))
