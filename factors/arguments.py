@@ -66,7 +66,7 @@ def checked_gtsam(what: str, value: Any, kind: type) -> None:
 
 def checked_array(what: str, value: ArrayLike, shape: tuple[int | None, ...]) -> FloatArray:
     """A read-only float64 copy of ``value`` with the given shape (None: any length), all finite."""
-    array = np.array(as_numbers(what, value, _wanted(shape)))
+    array = np.array(as_numbers(what, value, shape))
     if array.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
         found = f"shape {array.shape}" if array.ndim else described(value)
         raise FactorError(what, found, f"shape {_wanted(shape)}")
@@ -77,31 +77,34 @@ def checked_array(what: str, value: ArrayLike, shape: tuple[int | None, ...]) ->
 
 def checked_number_or_array(what: str, value: ArrayLike, shape: tuple[int | None, ...]) -> float | FloatArray:
     """One finite number, or an array as of :func:`checked_array`."""
-    array = as_numbers(what, value, f"{_wanted(shape)}, or one number")
+    array = as_numbers(what, value, shape, ", or one number")
     return checked_array(what, array, shape) if array.ndim else checked_number(what, float(array))
 
 
 def checked_rows(what: str, value: ArrayLike, columns: int) -> FloatArray:
     """``value`` as a float64 array (n, columns), not copied where it is one; NaN may be in it."""
-    array = as_numbers(what, value, f"(n, {columns})")
+    array = as_numbers(what, value, (None, columns))
     if array.ndim != 2 or array.shape[1] != columns:
         found = f"shape {array.shape}" if array.ndim else described(value)
         raise FactorError(what, found, f"shape (n, {columns})")
     return array
 
 
-def as_numbers(what: str, value: ArrayLike, shape: str = "") -> FloatArray:
+def as_numbers(
+    what: str, value: ArrayLike, shape: str | tuple[int | None, ...] = "", or_else: str = ""
+) -> FloatArray:
     """``value`` as a float64 array of any shape, not copied where it is one; texts, True and False are
     no numbers.
 
     Args:
-        shape: that is expected, for the message.
+        shape, or_else: that is expected, for the message.
     """
+    if type(value) is np.ndarray and value.dtype == np.float64:
+        return value
     if (masked := masked_values(value)) > 0:
         raise FactorError(what, count_of(masked, "masked value"), "an array without a mask")
-    if isinstance(value, np.ndarray) and value.dtype == np.float64:
-        return np.asarray(value)
-    expected = f"numbers of shape {shape}" if shape else "numbers"
+    wanted = shape if isinstance(shape, str) else _wanted(shape)
+    expected = f"numbers of shape {wanted}{or_else}" if wanted else "numbers"
     try:
         array = np.asarray(value)
         if array.dtype.kind not in "iuf":

@@ -66,8 +66,9 @@ class Alignment:
         for name in ("base_taus_s", "sigmas_px", "weights"):
             what = f"{name} of an alignment"
             value = checked_number_or_array(what, getattr(self, name), (n,))
-            value = np.full(n, value) if isinstance(value, float) else value
-            store(self, name, checked_array(what, value, (n,)))
+            if isinstance(value, float):
+                value = checked_array(what, np.full(n, value), (n,))
+            store(self, name, value)
         store(self, "pixels", checked_array("pixels of an alignment", self.pixels, (n, 2)))
         if (self.sigmas_px <= 0.0).any():
             raise FactorError("sigmas_px of an alignment", f"{self.sigmas_px.min():.3g}", "values above 0")

@@ -15,9 +15,10 @@ Points are columns here: (3, n); a Jacobian over k residual rows of n points is 
 
 Where all points share one tau, the scan moves as one rigid body, cP_i = cTl' . lP_i, and every
 derivative factors through the six numbers L_i = [cP_i x g_i; g_i] of a residual's gradient g_i by cP_i
-(a wrench): J_i = lift . L_i with one (13, 6) matrix for all points. :class:`RigidlyMoved` keeps that
-form, which halves the work, :class:`GroupsMoved` keeps it for the points of many images, each with its lift;
-:class:`PointwiseMoved` is the general case.
+(a wrench): J_i = lift . L_i with one (13, 6) matrix for all points. Where some objects move, a seventh number
+is the derivative by the way that the point's own has made, (cRl' u_i) . g_i, and belongs to the offset.
+:class:`RigidlyMoved` keeps that form, which halves the work, :class:`GroupsMoved` keeps it for the points of
+many images, each with its lift; :class:`PointwiseMoved` is the general case.
 """
 
 from __future__ import annotations
@@ -171,6 +172,7 @@ class RigidlyMoved:
         tau_s: interval of all points [s].
         xi, rate: (6,) twist of the displacement, -tau w, and -d xi / d tau.
         model: see :data:`MotionModel`.
+        c_velocities: (3, n) of the objects that the points lie on, in the camera [m/s], or None.
     """
 
     cPs: FloatArray
@@ -179,24 +181,26 @@ class RigidlyMoved:
     xi: FloatArray
     rate: FloatArray
     model: MotionModel
+    c_velocities: FloatArray | None = None
 
     @cached_property
     def lift(self) -> FloatArray:
-        """(13, 6) from a wrench to the derivatives by cTl (right perturbation, [rot, trans]), offset and
-        c_twist; made where it is asked for."""
+        """(13, 6), or (13, 7) with velocities, from :meth:`write_rows` to the derivatives by cTl (right
+        perturbation, [rot, trans]), offset and c_twist; made where it is asked for."""
         if self.model == "translation":
             left = np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
         else:
             left = se3_left_jacobian(self.xi)
-        lift = np.empty((13, 6))
-        lift[0:6] = self.cTl.AdjointMap().T
-        lift[6] = -left @ self.rate
-        lift[7:13] = -self.tau_s * left.T
+        lift = _no_lift(self.c_velocities)
+        lift[0:6, :6] = self.cTl.AdjointMap().T
+        lift[6, :6] = -left @ self.rate
+        lift[7:13, :6] = -self.tau_s * left.T
         return lift
 
     def write_rows(self, g: FloatArray, out: FloatArray) -> None:
-        """Wrenches [cP x g; g] into out (6, k, n), from the gradients g (3, k, n) by cP."""
-        _write_wrenches(self.cPs, g, out)
+        """Wrenches [cP x g; g] into out (6, k, n), from the gradients g (3, k, n) by cP; with velocities u
+        (7, k, n), u . g the last."""
+        _write_wrenches(self, g, out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,20 +209,31 @@ class GroupsMoved:
 
     Attributes:
         cPs: (3, n) points in the camera at their image's instant [m].
-        lift: (g, 13, 6) that of :class:`RigidlyMoved` for each group.
+        lift: (g, 13, 6) or (g, 13, 7), that of :class:`RigidlyMoved` for each group.
+        c_velocities: as there.
     """
 
     cPs: FloatArray
     lift: FloatArray
+    c_velocities: FloatArray | None = None
 
     def write_rows(self, g: FloatArray, out: FloatArray) -> None:
         """As of :class:`RigidlyMoved`."""
-        _write_wrenches(self.cPs, g, out)
+        _write_wrenches(self, g, out)
 
 
-def _write_wrenches(cPs: FloatArray, g: FloatArray, out: FloatArray) -> None:
-    write_cross(cPs[:, None, :], g, out[:3])
-    out[3:] = g
+def _no_lift(c_velocities: FloatArray | None, *groups: int) -> FloatArray:
+    """(..., 13, 6) zeros; with velocities (..., 13, 7), whose last column belongs to the offset."""
+    lift = np.zeros((*groups, 13, 6 if c_velocities is None else 7))
+    lift[..., 6, 6:] = 1.0
+    return lift
+
+
+def _write_wrenches(moved: RigidlyMoved | GroupsMoved, g: FloatArray, out: FloatArray) -> None:
+    write_cross(moved.cPs[:, None, :], g, out[:3])
+    out[3:6] = g
+    if moved.c_velocities is not None:
+        np.einsum("in,ikn->kn", moved.c_velocities, g, out=out[6])
 
 
 class _Exponential(NamedTuple):
@@ -350,12 +365,11 @@ def moved_points(
     """:func:`move_points` of arguments that were checked already."""
     c_twist, c_acceleration = motion.c_twist, motion.c_acceleration
     one_motion = c_twist.ndim == 1 and c_acceleration.ndim == 1
-    if l_velocities is not None or not one_motion:
-        taus_s = np.broadcast_to(np.asarray(taus_s, np.float64), lPs.shape[1:])
     if l_velocities is not None:
         lPs = lPs + taus_s * l_velocities
-    if isinstance(taus_s, float):
-        return _move_rigidly(cTl, lPs, taus_s, motion, model)
+    if isinstance(taus_s, float) and one_motion:
+        return _move_rigidly(cTl, lPs, taus_s, motion, model, l_velocities)
+    taus_s = np.broadcast_to(np.asarray(taus_s, np.float64), lPs.shape[1:])
     R = np.asarray(cTl.rotation().matrix())
     cPs = R @ lPs + np.asarray(cTl.translation()).reshape(3, 1)
     twists, changes = c_twist.reshape(6, -1), c_acceleration.reshape(6, -1) * taus_s
@@ -367,18 +381,29 @@ def moved_points(
 
 
 def _move_rigidly(
-    cTl: gtsam.Pose3, lPs: FloatArray, tau_s: float, motion: CameraTwist, model: MotionModel
+    cTl: gtsam.Pose3,
+    lPs: FloatArray,
+    tau_s: float,
+    motion: CameraTwist,
+    model: MotionModel,
+    l_velocities: FloatArray | None,
 ) -> RigidlyMoved:
     c_twist, c_acceleration = motion.c_twist, motion.c_acceleration
     xi = -tau_s * (c_twist - 0.5 * tau_s * c_acceleration)
     rate = c_twist - tau_s * c_acceleration
     moved = _moved_pose(cTl, xi, model)
     R, t = np.asarray(moved.rotation().matrix()), np.asarray(moved.translation())
-    return RigidlyMoved(R @ lPs + t.reshape(3, 1), moved, tau_s, xi, rate, model)
+    c_velocities = None if l_velocities is None else R @ l_velocities
+    return RigidlyMoved(R @ lPs + t.reshape(3, 1), moved, tau_s, xi, rate, model, c_velocities)
 
 
 def move_groups(
-    cTl: gtsam.Pose3, lPs: FloatArray, bounds: IntArray, taus_s: FloatArray, motion: CameraTwist
+    cTl: gtsam.Pose3,
+    lPs: FloatArray,
+    bounds: IntArray,
+    taus_s: FloatArray,
+    motion: CameraTwist,
+    l_velocities: FloatArray | None = None,
 ) -> GroupsMoved:
     """As :func:`move_points` of groups of points that share one tau and one image each.
 
@@ -387,16 +412,21 @@ def move_groups(
         bounds: (g + 1,) where each group begins, and the end.
         taus_s: (g,) intervals [s].
         motion: its rows are (g, 6), of each group's image.
+        l_velocities: as there.
     """
     taus, xis = taus_s[:, None], _group_xis(taus_s, motion)
     poses = [gtsam.Pose3.Expmap(xi) * cTl for xi in xis]
-    left = np.array([se3_left_jacobian(xi) for xi in xis])
+    left = np.array([gtsam.Pose3.ExpmapDerivative(xi) for xi in -xis])  # as se3_left_jacobian
     rates = motion.c_twist - taus * motion.c_acceleration
-    lift = np.empty((len(xis), 13, 6))
-    lift[:, :6] = np.array([pose.AdjointMap() for pose in poses]).transpose(0, 2, 1)
-    lift[:, 6] = -(left @ rates[:, :, None])[:, :, 0]
-    lift[:, 7:] = -taus[:, :, None] * left.transpose(0, 2, 1)
-    return GroupsMoved(transformed(np.array([pose.matrix() for pose in poses]), lPs, bounds), lift)
+    matrices, c_velocities = np.array([pose.matrix() for pose in poses]), None
+    if l_velocities is not None:
+        lPs = lPs + taus_s.repeat(np.diff(bounds)) * l_velocities
+        c_velocities = rotated(matrices, l_velocities, bounds)
+    lift = _no_lift(c_velocities, len(xis))
+    lift[:, :6, :6] = np.array([pose.AdjointMap() for pose in poses]).transpose(0, 2, 1)
+    lift[:, 6, :6] = -(left @ rates[:, :, None])[:, :, 0]
+    lift[:, 7:, :6] = -taus[:, :, None] * left.transpose(0, 2, 1)
+    return GroupsMoved(transformed(matrices, lPs, bounds), lift, c_velocities)
 
 
 def group_poses(cTl: gtsam.Pose3, taus_s: FloatArray, motion: CameraTwist) -> FloatArray:
@@ -413,11 +443,17 @@ def _group_xis(taus_s: FloatArray, motion: CameraTwist) -> FloatArray:
 
 def transformed(poses: FloatArray, points: FloatArray, bounds: IntArray) -> FloatArray:
     """(3, n) points (3, n) of groups under the pose (g, 4, 4) of each; bounds (g + 1,)."""
-    moved = np.empty_like(points)
-    for pose, (a, b) in zip(poses, pairwise(bounds.tolist()), strict=True):
-        np.matmul(pose[:3, :3], points[:, a:b], out=moved[:, a:b])
-    moved += np.repeat(poses[:, :3, 3].T, np.diff(bounds), axis=1)
+    moved = rotated(poses, points, bounds)
+    moved += poses[:, :3, 3].T.repeat(np.diff(bounds), axis=1)
     return moved
+
+
+def rotated(poses: FloatArray, vectors: FloatArray, bounds: IntArray) -> FloatArray:
+    """The same of vectors, which poses only turn."""
+    turned = np.empty_like(vectors)
+    for R, (a, b) in zip(poses[:, :3, :3], pairwise(bounds.tolist()), strict=True):
+        np.matmul(R, vectors[:, a:b], out=turned[:, a:b])
+    return turned
 
 
 def _moved_pose(cTl: gtsam.Pose3, xi: FloatArray, model: MotionModel) -> gtsam.Pose3:

@@ -156,8 +156,8 @@ class Evaluated:
     Attributes:
         rows: (m, k, n): rows that ``lift`` turns into the Jacobian's first 13 columns, the bias's column
             where there is one, and the residual last.
-        lift: (13, 6), or (g, 13, 6) one for each group of matches, or None where the first 13 rows are the
-            columns themselves.
+        lift: (13, l), or (g, 13, l) one for each group of matches, of the first l rows; or None where the
+            first 13 rows are the columns themselves.
         behind: (n,) points behind the camera, or None where there is none.
     """
 
@@ -168,7 +168,8 @@ class Evaluated:
     def system(self) -> FloatArray:
         """[J r], column by column: (cols + 1, k n)."""
         rows = self.rows.reshape(len(self.rows), -1)
-        return rows if self.lift is None else np.concatenate([self.lift @ rows[:6], rows[6:]])
+        motion = self.motion_rows
+        return rows if self.lift is None else np.concatenate([self.lift @ rows[:motion], rows[motion:]])
 
     def with_terms(self, coefficients: FloatArray, steps: FloatArray, jacobians: bool) -> Evaluated:
         """The same with linear terms added to the residuals of silhouettes, before any weighting.
@@ -181,10 +182,15 @@ class Evaluated:
         seen = coefficients if self.behind is None else np.where(self.behind, 0.0, coefficients)
         rows = self.rows
         if jacobians:
-            motion = 13 if self.lift is None else 6
+            motion = self.motion_rows
             rows = np.concatenate([rows[:motion], seen[:, None, :], rows[motion:]])
         rows[-1, 0] += steps @ seen
         return Evaluated(rows, self.lift, self.behind)
+
+    @property
+    def motion_rows(self) -> int:
+        """How many rows belong to the motion."""
+        return _motion_rows(self.lift)
 
     def by_group(self, groups: NDArray[np.intp], count: int) -> Evaluated:
         """The same with a bias column for each of ``count`` groups of matches; groups (n,)."""
@@ -210,11 +216,15 @@ class Evaluated:
     def whole_lift(self) -> FloatArray:
         """(cols + 1, m) from all rows of the short form; (g, cols + 1, m) of groups."""
         assert self.lift is not None
-        m = len(self.rows)
-        lift = np.zeros((*self.lift.shape[:-2], m + 7, m))
-        lift[..., :13, :6] = self.lift
-        lift[..., 13:, 6:] = np.eye(m - 6)
+        m, motion = len(self.rows), self.motion_rows
+        lift = np.zeros((*self.lift.shape[:-2], 13 + m - motion, m))
+        lift[..., :13, :motion] = self.lift
+        lift[..., 13:, motion:] = np.eye(m - motion)
         return lift
+
+
+def _motion_rows(lift: FloatArray | None) -> int:
+    return 13 if lift is None else lift.shape[-1]
 
 
 def evaluate(
@@ -251,7 +261,7 @@ def evaluate_moved(
     xy = moved.cPs[:2] * inverse_z
 
     lift = moved.lift if jacobians else None
-    motion_rows = (13 if lift is None else 6) if jacobians else 0
+    motion_rows = _motion_rows(lift) if jacobians else 0
     has_bias = jacobians and bias_px is not None
     rows = np.empty((motion_rows + has_bias + 1, alignment.rows_per_match, len(alignment)))
     _write_residuals(alignment, xy, bias_px, rows[-1])

@@ -134,7 +134,7 @@ class PairedEdges:
         owners: (n,) number of the object of each point, counted over all groups.
         bounds: (g + 1,) where each group begins, and the end.
         contours: of each group's class in its image; for objects without a class the picture's gradients.
-        motions: the camera's around each group's image.
+        motion: the camera's, its rows (g, 6) of each group's image, or (6,) where all share one.
         base_taus_s: (n,) stamp of the image minus the time of the point [s].
         biases_px: (g,) mask bias of each group's class [px].
         velocities: (n, 3) velocity over ground of each point's object, in the LiDAR frame, or None where all
@@ -146,7 +146,7 @@ class PairedEdges:
     owners: IntArray
     bounds: IntArray
     contours: Sequence[ContourMap | PictureGradients]
-    motions: Sequence[CameraTwist]
+    motion: CameraTwist
     base_taus_s: FloatArray
     biases_px: FloatArray
     velocities: FloatArray | None = None
@@ -156,18 +156,23 @@ class PairedEdges:
         return PairedEdges(
             self.camera,
             self.points.take(index),
-            self.owners[index],
+            self.owners.take(index),
             np.searchsorted(index, self.bounds),
             self.contours,
-            self.motions,
-            self.base_taus_s[index],
+            self.motion,
+            self.base_taus_s.take(index),
             self.biases_px,
             None if self.velocities is None else self.velocities.take(index, axis=0),
         )
 
     def repeated(self, of_groups: ArrayLike) -> NDArray[Any]:
         """(n, ...) the value of each point's group, from those of the groups (g, ...)."""
-        return np.repeat(np.asarray(of_groups), np.diff(self.bounds), axis=0)
+        return np.asarray(of_groups).repeat(self.counts, axis=0)
+
+    @cached_property
+    def counts(self) -> IntArray:
+        """(g,) points of each group."""
+        return np.diff(self.bounds)
 
     def projected(
         self, lPs: FloatArray, cTl: gtsam.Pose3, time_offset_s: float, poses: FloatArray | None = None
@@ -190,7 +195,8 @@ class PairedEdges:
         if poses is None:
             poses = self.poses(cTl, time_offset_s)
         if poses is None:
-            each = CameraTwist(*(self.repeated(rows).T for rows in self.motion_rows))
+            rows = self.motion.c_twist, self.motion.c_acceleration
+            each = self.motion if rows[0].ndim == 1 else CameraTwist(*(self.repeated(row).T for row in rows))
             return np.asarray(moved_points(cTl, columns, taus, each, "se3", None).cPs.T)
         return transformed(poses, columns, self.bounds).T
 
@@ -202,15 +208,13 @@ class PairedEdges:
         base_taus_s = self.base_taus_s[np.minimum(self.bounds[:-1], len(self.base_taus_s) - 1)]
         if not np.array_equal(self.base_taus_s, self.repeated(base_taus_s)):
             return None
-        return group_poses(cTl, time_offset_s + base_taus_s, CameraTwist(*self.motion_rows))
+        return group_poses(cTl, time_offset_s + base_taus_s, self.motion)
 
     def accelerations(self, counts: IntArray) -> FloatArray:
         """(6,) where all groups share it, else (m, 6): of the image of each of so many points a group (g,)
         [rad/s^2, m/s^2]."""
-        first = self.motions[0]
-        if all(motion is first for motion in self.motions):
-            return first.c_acceleration
-        return np.repeat(self.motion_rows[1], counts, axis=0)
+        shared = self.motion.c_acceleration
+        return shared if shared.ndim == 1 else shared.repeat(counts, axis=0)
 
     @cached_property
     def by_masks(self) -> BoolArray:
@@ -222,14 +226,6 @@ class PairedEdges:
     def spans(self) -> list[tuple[int, int]]:
         """Where each group begins and ends."""
         return list(pairwise(self.bounds.tolist()))
-
-    @cached_property
-    def motion_rows(self) -> tuple[FloatArray, FloatArray]:
-        """(g, 6) twists and accelerations."""
-        return (
-            np.array([motion.c_twist for motion in self.motions]),
-            np.array([motion.c_acceleration for motion in self.motions]),
-        )
 
 
 @dataclass(frozen=True)
@@ -308,7 +304,7 @@ def match_silhouettes(
         numbered_through([part.objects for part in parts]),
         bounds,
         [pair.contours[c] for c in classes],
-        [pair.motion] * len(classes),
+        pair.motion,
         pair.base_tau_s - points.offsets_s,
         np.array([biases_px.get(c, 0.0) for c in classes]),
         moving,
@@ -366,11 +362,10 @@ def match_edges(
         uvs = ideal + shift
     index = np.flatnonzero(paired.camera.in_image(uvs))
     some, uvs = paired.take(index), uvs.take(index, axis=0)
-    seen, objects_seen = np.diff(some.bounds), np.bincount(some.owners)
-    tips: FloatArray | None = None
+    tips = some.projected(some.points.outward, cTl, time_offset_s, poses)
+    objects_seen = np.bincount(some.owners)
     # 2. Find the nearest contours within the gate.
     if any(isinstance(contour, PictureGradients) for contour in paired.contours):
-        tips = some.projected(some.points.outward, cTl, time_offset_s, poses)
         ways = tips - (uvs if shift is None else ideal.take(index, axis=0))
         feet, shares = _contours_or_gradients(some, uvs, ways, kernel, config.edge_place)
     else:
@@ -380,51 +375,48 @@ def match_edges(
     distances = feet.distances if enlarged is None else feet.distances / enlarged
     residuals = distances + some.repeated(some.biases_px)
     near = np.flatnonzero(feet.valid & (np.abs(residuals) < GATE * kernel.scale))
-    index, some = index[near], some.take(near)
-    uvs, normals, pixels = (rows.take(near, axis=0) for rows in (uvs, feet.normals, feet.feet))
+    index, owners = index.take(near), some.owners.take(near)
+    rows = uvs, tips, feet.normals, feet.feet
+    uvs, tips, normals, pixels = (each.take(near, axis=0) for each in rows)
     # 3. Keep contours that face the outward direction of the object.
-    if tips is None:
-        tips = some.projected(some.points.outward, cTl, time_offset_s, poses)
-    else:
-        tips = tips.take(near, axis=0)
     if shift is not None and deviation is not None:
-        shift = shift.take(index, axis=0)
-        own = deviation.take(index)
-        tips = tips + _pixel_shift(own, some, tips, _effect(own, some, tips))
-        pixels = pixels - shift
+        own, moved = deviation.take(index), some.take(near)
+        tips = tips + _pixel_shift(own, moved, tips, _effect(own, moved, tips))
+        pixels = pixels - shift.take(index, axis=0)
     outward = tips - uvs
     length = np.sqrt(np.vecdot(outward, outward))
     outward = outward / np.maximum(length, 1e-9)[:, None]
     cosine = np.vecdot(outward, normals)
     # 4. Keep objects of which enough points have a match.
-    on = np.flatnonzero(of_matched_objects(faces(cosine), some.owners, objects_seen, MIN_OBJECT_SHARE))
-    index, owners, length = index[on], some.owners[on], length[on]
+    on = np.flatnonzero(of_matched_objects(faces(cosine), owners, objects_seen, MIN_OBJECT_SHARE))
+    index, owners, length = index.take(on), owners.take(on), length.take(on)
     if enlarged is not None:
         enlarged = enlarged[near][on]
         length = length / enlarged
-    sigmas = match_sigmas(length, cosine[on], config)
-    sides = sides_of(paired.points.edges[index], outward[on, 0])
+    sigmas = match_sigmas(length, cosine.take(on), config)
+    sides = sides_of(paired.points.edges.take(index), outward[on, 0])
     level_px = level_sigmas(sides, sigmas, config)
     if shares is not None:
         level_px = np.where(paired.by_masks[index], level_px, 0.0)
-    weights = side_weights(owners, sides, sigmas, config, (level_px, paired.points.rings[index]))
+    weights = side_weights(owners, sides, sigmas, config, (level_px, paired.points.rings.take(index)))
     shares = np.ones(len(index)) if shares is None else shares[near][on]
     weights = weights * shares
     bounds = np.searchsorted(index, paired.bounds)
+    velocities = None if paired.velocities is None else paired.velocities.take(index, axis=0)
     alignment = Alignment(
         camera=paired.camera,
         lPs=paired.points.lPs.take(index, axis=0),
-        base_taus_s=paired.base_taus_s[index],
+        base_taus_s=paired.base_taus_s.take(index),
         pixels=pixels.take(on, axis=0),
         sigmas_px=sigmas,
         normals=normals.take(on, axis=0),
         kernel=kernel,
         c_acceleration=paired.accelerations(np.diff(bounds)),
         weights=weights,
-        l_velocities=None if paired.velocities is None else paired.velocities.take(index, axis=0),
+        l_velocities=velocities if velocities is not None and velocities.any() else None,
         stretches=enlarged,
     )
-    return EdgeMatches(index, sides, alignment, bounds, seen, shares, level_px)
+    return EdgeMatches(index, sides, alignment, bounds, some.counts, shares, level_px)
 
 
 def _contours_or_gradients(
@@ -439,33 +431,38 @@ def _contours_or_gradients(
     Returns:
         The contours, and (n,) the share of its full weight that each has.
     """
-    n, biases = len(uvs), paired.repeated(paired.biases_px)
-    distances, shares, valid = np.zeros(n), np.ones(n), np.zeros(n, np.bool_)
-    normals, feet = np.tile([1.0, 0.0], (n, 1)), uvs.copy()
-    masked, unmasked = np.flatnonzero(paired.by_masks), np.flatnonzero(~paired.by_masks)
-    for index in (masked, unmasked):
-        some = paired.take(index) if len(index) < n else paired
+    n, found = len(uvs), []
+    if n == 0:
+        return nearest_contours([], [], uvs), np.zeros(0)
+    for masks in (True, False):
+        index = np.flatnonzero(paired.by_masks == masks)
+        if len(index) == 0:
+            continue
+        some, own, way = paired, uvs, ways
+        if len(index) < n:
+            some, own, way = paired.take(index), uvs.take(index, axis=0), ways.take(index, axis=0)
         groups = [
             (each, span) for each, span in zip(some.contours, some.spans, strict=True) if span[1] > span[0]
         ]
-        if not groups:
-            continue
-        spans, own = [span for _, span in groups], uvs[index]
-        if index is masked:
+        spans = [span for _, span in groups]
+        if masks:
             maps = [each for each, _ in groups if isinstance(each, ContourMap)]
-            found = nearest_contours(maps, spans, own)
-            distances[index] = found.distances
-        else:
-            pictures = [each for each, _ in groups if isinstance(each, PictureGradients)]
-            outward = ways[index] / np.maximum(np.linalg.norm(ways[index], axis=1), 1e-9)[:, None]
-            # The window is where the residual is 0.
-            bias = biases[index]
-            moved = own + bias[:, None] * outward
-            edges = nearest_edges(pictures, spans, moved, outward, kernel.scale, place)
-            found, shares[index] = edges, np.maximum(edges.shares, 1e-3)
-            distances[index] = edges.distances - bias
-        normals[index], feet[index], valid[index] = found.normals, found.feet, found.valid
-    return ContourFeet(distances, normals, feet, valid), shares
+            found.append((index, nearest_contours(maps, spans, own), np.ones(len(index))))
+            continue
+        pictures = [each for each, _ in groups if isinstance(each, PictureGradients)]
+        right, down = way.T
+        outward = way / np.maximum(np.sqrt(right**2 + down**2), 1e-9)[:, None]
+        # The window is where the residual is 0.
+        bias = some.repeated(some.biases_px)
+        edges = nearest_edges(pictures, spans, own + bias[:, None] * outward, outward, kernel.scale, place)
+        feet = ContourFeet(edges.distances - bias, edges.normals, edges.feet, edges.valid)
+        found.append((index, feet, np.maximum(edges.shares, 1e-3)))
+    if len(found) == 1:
+        return found[0][1:]
+    order = np.argsort(np.concatenate([index for index, _, _ in found]))
+    parts = [(feet.distances, feet.normals, feet.feet, feet.valid, shares) for _, feet, shares in found]
+    *whole, shares = (np.concatenate(each).take(order, axis=0) for each in zip(*parts, strict=True))
+    return ContourFeet(*whole), shares
 
 
 def _effect(deviation: PointDeviation, paired: PairedEdges, uvs: FloatArray) -> Effect:
@@ -566,7 +563,8 @@ def side_weights(
     if level is not None:
         level_px, rings = level
         on = np.flatnonzero(level_px)
-        groups = numbers.take(on) * (int(rings.max(initial=0)) + 1) + rings.take(on)
+        numbers = numbers.take(on) * (int(rings.max(initial=0)) + 1) + rings.take(on)
+        _, groups = np.unique(numbers, return_inverse=True)
         shared[on] += _information(groups, sigmas_px.take(on)) * level_px.take(on) ** 2
     return np.asarray(1.0 / (1.0 + shared))
 

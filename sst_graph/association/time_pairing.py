@@ -75,9 +75,9 @@ def nearest_images(
     scans = (np.asarray(scan_stamps_ns, dtype=np.int64) - epoch) * 1e-9
     base = (np.asarray(image_stamps_ns, dtype=np.int64) - epoch) * 1e-9
     away = offsets_s[:, None]
-    right = np.clip(np.searchsorted(base, scans - away), 1, max(1, len(base) - 1))
-    left = right - 1
-    right = np.minimum(right, len(base) - 1)
+    last = len(base) - 1
+    right = np.minimum(np.maximum(np.searchsorted(base, scans - away), 1), max(1, last))
+    left, right = right - 1, np.minimum(right, last)
     early, late = (np.abs(base[side] + away - scans) for side in (left, right))
     nearest = np.where(early <= late, left, right)
     close = np.minimum(early, late) <= max_interval_s

@@ -10,7 +10,7 @@ import numpy as np
 
 from sst_graph.odometry.smoothing import MotionSmoother
 from sst_graph.odometry.standstill import ZeroVelocityUpdate
-from sst_graph.types import FloatArray, IntArray, RelativeMotion
+from sst_graph.types import FloatArray, RelativeMotion
 
 
 @dataclass(frozen=True)
@@ -73,13 +73,12 @@ class SensorTwists:
         """Twists and accelerations at several stamps of the sensor's clock."""
         t = np.array([stamp - self._epoch for stamp in stamps_ns], np.float64) * 1e-9
         k, n = len(t), len(self._middles)
-        if n == 1:
+        if n == 1 or k == 0:
             twist, covariance = self._motions[0].mean_twist, _covariance(self._motions[0])
             return TwistSamples(np.tile(twist, (k, 1)), np.zeros((k, 6)), np.tile(covariance, (k, 1, 1)))
-        i = np.clip(np.searchsorted(self._middles, t) - 1, 0, n - 2)
-        used, place = np.unique(np.concatenate([i, i + 1]), return_inverse=True)
-        place = place.reshape(2, k)
-        twists, rates = self._at_middles(used)
+        i = np.minimum(np.maximum(np.searchsorted(self._middles, t) - 1, 0), n - 2)
+        first, place = int(i.min()), np.array([i, i + 1]) - i.min()
+        twists, rates, known = self._at_middles(first, int(i.max()) + 2)
         (before, after), (rate_before, rate_after) = twists[place], rates[place]
         spans = self._middles[i + 1] - self._middles[i]
         fractions = np.minimum(np.maximum((t - self._middles[i]) / spans, -0.5), 1.5)
@@ -93,21 +92,22 @@ class SensorTwists:
         rate = rate_before + s * (2.0 * square + 3.0 * s * cube)
         # As if both errors were equal, as they nearly are for smoothed motions.
         weights = np.abs([1.0 - fractions, fractions])[:, :, None, None]
-        covariances = np.array([_covariance(self._motions[number]) for number in used.tolist()])[place]
-        total = weights[0] * covariances[0] + weights[1] * covariances[1]
+        covariances = weights * known[place]
+        total = covariances[0] + covariances[1]
         beyond = (fractions - inside) * spans
         total[:, _AXES, _AXES] += (rate * beyond[:, None]) ** 2
         return TwistSamples(value + rate * beyond[:, None], rate, total)
 
-    def _at_middles(self, numbers: IntArray) -> tuple[FloatArray, FloatArray]:
-        """(k, 6) twists and (k, 6) accelerations at the middles of some intervals: by the cubic of the pose
-        through four stamps, in the manner of Newton; of the first and the last interval by a parabola."""
-        last = len(self._motions) - 1
-        around = np.clip(numbers[:, None] + [-1, 0, 1], 0, last)
-        needed, place = np.unique(around, return_inverse=True)
-        known = [self._motions[number] for number in needed.tolist()]
-        means = np.array([motion.mean_twist for motion in known])[place.reshape(around.shape)]
-        h = np.array([motion.seconds for motion in known])[place.reshape(around.shape)][..., None]
+    def _at_middles(self, first: int, end: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """(k, 6) twists and accelerations, and (k, 6, 6) covariances, at the middles of some intervals in a
+        row: by the cubic of the pose through four stamps, in the manner of Newton; of the first and the last
+        interval of all by a parabola."""
+        numbers, last, start = np.arange(first, end), len(self._motions) - 1, max(first - 1, 0)
+        around = np.minimum(np.maximum(numbers[:, None] + [-1, 0, 1], 0), last) - start
+        known = self._motions[start : end + 1]
+        means = np.array([motion.mean_twist for motion in known])[around]
+        h = np.array([motion.seconds for motion in known])[around][..., None]
+        covariances = np.array([motion.covariance for motion in known])[around[:, 1]]
         before = (means[:, 1] - means[:, 0]) / (h[:, 0] + h[:, 1])
         after = (means[:, 2] - means[:, 1]) / (h[:, 1] + h[:, 2])
         inner = (numbers > 0) & (numbers < last)
@@ -117,7 +117,7 @@ class SensorTwists:
         twists = means[:, 1] - 0.25 * h[:, 1] ** 2 * third
         rates = 2.0 * before + third * (2.0 * h[:, 0] + h[:, 1])
         twists[still], rates[still] = 0.0, 0.0
-        return twists, rates
+        return twists, rates, covariances / h[:, 1, :, None] ** 2
 
 
 _AXES = np.arange(6)

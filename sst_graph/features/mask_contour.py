@@ -157,7 +157,7 @@ def nearest_contours(
     )
     valid = well_inside(uvs[:, 0], uvs[:, 1], width, height)
     corners = np.array([(contour.left, contour.top) for contour in contours])
-    corner = corners.T if len(contours) == 1 else np.repeat(corners, counts, axis=0).T
+    corner = corners.T if len(contours) == 1 else corners.repeat(counts, axis=0).T
     safe = np.where(valid, uvs.T, BORDER_PX + 1.0)
     u, v = ((safe - corner)[:, :, None] + _CROSS).astype(np.float32)
     samples = np.empty((n, 5), np.float32)
@@ -202,9 +202,8 @@ def are_unknown(
 ) -> NDArray[np.bool_]:
     """(n,) whether nothing is known of the contours at columns and rows (2, n) of their boxes; spans as in
     :func:`nearest_contours`."""
-    boxes = np.array([contour.box for contour in contours])
-    boxes = np.repeat(boxes, [b - a for a, b in spans], axis=0).T
-    column, row = np.clip(np.rint(places).astype(np.intp), 0, boxes - 1)
+    boxes = np.array([contour.box for contour in contours]).repeat([b - a for a, b in spans], axis=0).T
+    column, row = np.minimum(np.maximum(np.rint(places).astype(np.intp), 0), boxes - 1)
     at = row * boxes[0] + column
     found = np.empty(places.shape[1], np.uint8)
     for contour, (a, b) in zip(contours, spans, strict=True):

@@ -162,17 +162,17 @@ def profiles(
     across, down = outward.T.astype(np.float32)
     u, v = u + distances * across, v + distances * down
     # To the sides the picture's border goes on; above and below lie other directions.
-    np.clip(v, np.float32(0.0), (height - 1).astype(np.float32), out=v)
+    np.maximum(v, np.float32(0.0), out=v)
+    np.minimum(v, (height - 1).astype(np.float32), out=v)
     v += (number * height).astype(np.float32)
-    column, row = (uvs / 4.0).astype(np.intp).T
-    quarter = -(-height // 4)
-    column, row = np.clip(column, 0, -(-width // 4) - 1), np.clip(row, 0, quarter - 1)
-    row = row + number * quarter
+    column, row = np.maximum((uvs / 4.0).astype(np.intp).T, 0)
+    columns, rows = -(-width // 4), -(-height // 4)
+    places = (np.minimum(row, rows - 1) + number * rows) * columns + np.minimum(column, columns - 1)
     # 2. Look.
     for each, (a, b) in zip(gradients, spans, strict=True):
         if b > a:
             found[:, a:b] = sampled(each.strengths, u[:, a:b], v[:, a:b])
-            usual[a:b] = each.usual[row[a:b], column[a:b]]
+            usual[a:b] = each.usual.take(places[a:b])
     found -= usual
     found /= np.float32(UNIT)
     return found

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
+import mmap
 import os
 import tempfile
 from collections.abc import Callable
@@ -99,7 +100,11 @@ class ArrayStore:
         size = math.prod(shape) * dtype.itemsize
         if size >= _MAPPED_BYTES:
             with suppress(OSError, ValueError):  # of a file that cannot be mapped
-                return np.memmap(self._file, dtype, "r", start, shape).view(np.ndarray)
+                # Not by numpy.memmap, which takes as long again as the system.
+                before = start % mmap.ALLOCATIONGRANULARITY
+                file, length, access = self._file.fileno(), before + size, mmap.ACCESS_READ
+                mapped = mmap.mmap(file, length, access=access, offset=start - before)
+                return np.frombuffer(mapped, dtype, offset=before).reshape(shape)
         data = os.pread(self._file.fileno(), size, start)
         if len(data) < size:
             raise OSError(f"the temporary file of a drive ends {count_of(size - len(data), 'byte')} early")

@@ -169,10 +169,12 @@ def _add_biases(
     for drive, c in classes:
         graph.add(gtsam.PriorFactorVector(bias_key(drive, c), np.zeros(1), noise))
         values.insert(bias_key(drive, c), np.array([state.biases_px.get((drive, c), 0.0)]))
+    if not objects:
+        return
+    lower, own = LOWER_EDGE_BIAS_SIGMA_PX, config.object_bias_sigma_px
+    lower_noise, own_noise = (gtsam.noiseModel.Isotropic.Sigma(1, sigma_px) for sigma_px in (lower, own))
     for drive, c, track in objects:
-        key = object_bias_key(drive, track)
-        sigma_px = LOWER_EDGE_BIAS_SIGMA_PX if track == lower_edge_track(c) else config.object_bias_sigma_px
-        noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma_px)
+        key, noise = object_bias_key(drive, track), lower_noise if track == lower_edge_track(c) else own_noise
         graph.add(gtsam.BetweenFactorVector(bias_key(drive, c), key, np.zeros(1), noise))
         values.insert(key, np.array([state.object_bias_px(drive, track, c)]))
 

@@ -191,8 +191,7 @@ class _Frames:
         each = np.broadcast_to(alignment.c_acceleration, (len(alignment), 6))
         own = np.column_stack([alignment.base_taus_s, each])
         rigid = np.array_equal(own, np.repeat(own[starts], np.diff(self.bounds), axis=0))
-        rigid = rigid and alignment.l_velocities is None and alignment.motion_model == "se3"
-        return each[starts] if rigid else None
+        return each[starts] if rigid and alignment.motion_model == "se3" else None
 
     @cached_property
     def columns(self) -> IntArray:
@@ -240,7 +239,7 @@ class FrozenProblem:
         # 2. Images and matches.
         self._images = _images(matches, state, self._columns)
         places = {key: number for number, key in enumerate(self._images.keys)}
-        self._frames = [frames for own in matches for frames in self._frames_of(own, places)]
+        self._frames = [self._frames_of(own, places) for own in matches]
         scalars = [float(values.atVector(key)[0]) for key in self._keys]
         self.start = FrozenPoint(state.cTl, np.array(scalars), self._images.twists)
 
@@ -363,10 +362,10 @@ class FrozenProblem:
             cells = (lift[frames.cell_spans] @ cells.T[:, :, None])[:, :, 0].T
         # 3. They belong to the extrinsic, the time offset and the parameters, to the twists,
         places, columns = frames.places, frames.columns
-        shared, twist = [*range(7), *range(13, 13 + len(frames.terms))], slice(7, 13)
-        of_shared = products[:, :, shared]
+        shared, twist = np.array([*range(7), *range(13, 13 + len(frames.terms))]), slice(7, 13)
+        of_shared = products.take(shared, axis=2)
         total = of_shared.sum(axis=0)
-        system.H[columns[:, None], columns] += total[shared]
+        system.H[columns[:, None], columns] += total.take(shared, axis=0)
         system.g[columns] += total[-1]
         system.H_twists[places] += products[:, twist, twist]
         system.g_twists[places] += products[:, twist, -1]
@@ -375,9 +374,10 @@ class FrozenProblem:
         bias, image_of = frames.biases[frames.cells], frames.images[frames.cells]
         by_bias = np.zeros((len(system.g), len(cells)))
         np.add.at(by_bias, bias, cells.T)
-        system.H[columns] += by_bias[:, shared].T
-        system.H[:, columns] += by_bias[:, shared]
-        np.fill_diagonal(system.H, system.H.diagonal() + by_bias[:, -2])
+        with_shared = by_bias.take(shared, axis=1)
+        system.H[columns] += with_shared.T
+        system.H[:, columns] += with_shared
+        np.einsum("ii->i", system.H)[...] += by_bias[:, -2]
         system.g[...] += by_bias[:, -1]
         system.H_mixed[image_of, :, bias] += cells[twist].T
         return 0.5 * (float(rows[-1] @ rows[-1]) + constant)
@@ -392,17 +392,16 @@ class FrozenProblem:
         else:
             motion = CameraTwist(point.twists[frames.places], frames.accelerations)
             taus_s = time_offset_s + alignment.base_taus_s[frames.bounds[:-1]]
-            moved = move_groups(point.cTl, alignment.columns[0], frames.bounds, taus_s, motion)
+            lPs, velocities = alignment.columns[0], alignment.velocity_columns
+            moved = move_groups(point.cTl, lPs, frames.bounds, taus_s, motion, velocities)
             evaluated = evaluate_moved(alignment, moved, biases_px, True)
         if not self._terms:
             return evaluated
         steps = point.scalars[np.array(self._terms) - 6] - frames.terms_at
         return evaluated.with_terms(frames.terms, steps, True)
 
-    def _frames_of(self, matches: DriveMatches, places: dict[int, int]) -> list[_Frames]:
-        """Of the static points of a drive, and of those on objects that move: these alone do not move as one
-        rigid body with their image's."""
-        number, alignment = matches.number, matches.alignment
+    def _frames_of(self, matches: DriveMatches, places: dict[int, int]) -> _Frames:
+        number = matches.number
         pairs = [twist_key(number, pair.image) for pair in matches.pairs]
         images = np.array([places.get(key, -1) for key in pairs])[matches.pair_of]
         biases = _bias_columns(matches, self._columns)
@@ -414,18 +413,8 @@ class FrozenProblem:
         )
         clock = self._columns[time_offset_key(self.state.clock(number))]
         terms_at = np.array([self.state.nuisances.get(name, 0.0) for name in self._names])
-
-        def frames_of(alignment: Alignment, some: IntArray) -> _Frames:
-            return _Frames(
-                alignment.take(some), images[some], biases[some], clock, self._terms, terms[:, some], terms_at
-            )
-
-        if alignment.l_velocities is None:
-            return [frames_of(alignment, order)]
-        moving = np.atleast_1d(alignment.l_velocities.any(axis=1))[order]
-        static = replace(alignment, l_velocities=None)
-        parts = (static, order[~moving]), (alignment, order[moving])
-        return [frames_of(own, some) for own, some in parts if len(some)]
+        alignment, images, biases = matches.alignment.take(order), images[order], biases[order]
+        return _Frames(alignment, images, biases, clock, self._terms, terms[:, order], terms_at)
 
 
 def _ordered(keys: Sequence[int]) -> gtsam.Ordering:

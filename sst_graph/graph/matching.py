@@ -318,24 +318,24 @@ class DriveEdges:
             return None
         paired, group_pairs = at.paired, at.group_pairs
         # 2. Match them.
-        scene = at.motions.scene(drive, paired.repeated(group_pairs))
-        deviation = deviation_of(state.nuisances, scene)
+        deviation = None
+        if any(state.nuisances.values()):
+            scene = at.motions.scene(drive, paired.repeated(group_pairs))
+            deviation = deviation_of(state.nuisances, scene)
         found = match_edges(paired, state.cTl, time_offset_s, kernel, self.config, deviation)
         if len(found.index) == 0:
             return None
         if at.shares is not None and not (at.shares == 1.0).all():
             weights = at.shares[found.index] * found.alignment.weights
             found = replace(found, alignment=replace(found.alignment, weights=weights))
-        firsts = paired.bounds[:-1]
         return DriveMatches(
             self,
             at.pairs,
             at.motions,
             found,
+            at.groups,
             np.array(group_pairs),
-            [self.classes[g] for g in at.groups],
-            at.index[found.index],
-            found.index - np.repeat(firsts, np.diff(found.bounds)),
+            at.index.take(found.index),
             state.cTl,
             time_offset_s,
         )
@@ -362,18 +362,32 @@ class DriveEdges:
         ]
         if not groups:
             return None
-        # 2. The motion around the images.
-        motions = _Motions.of(self, pairs, state)
-        # 3. The points, without the objects whose weight is 0.
-        paired, index = self._paired(groups, pairs, motions, state)
-        shares = None
-        if self.unknown_mps is not None:
-            taus_s = time_offset_s + paired.repeated([pairs[p].base_tau_s for _, p in groups])
-            shares = dynamic_object_weights(self.unknown_mps[index], taus_s, DYNAMIC_REACH_M)
-            if not shares.all():
-                kept = np.flatnonzero(shares)
-                paired, index, shares = paired.take(kept), index[kept], shares[kept]
         chosen, group_pairs = [g for g, _ in groups], [p for _, p in groups]
+        # 2. Their points, without the objects whose weight is 0.
+        spans = [(int(self.bounds[g]), int(self.bounds[g + 1])) for g in chosen]
+        index = np.concatenate([np.arange(*span) for span in spans])
+        bounds = np.cumsum([0, *(b - a for a, b in spans)])
+        base_taus_s, shares = np.array([pairs[p].base_tau_s for p in group_pairs]), None
+        if self.unknown_mps is not None:
+            taus_s = time_offset_s + base_taus_s.repeat(np.diff(bounds))
+            shares = dynamic_object_weights(self.unknown_mps.take(index), taus_s, DYNAMIC_REACH_M)
+            kept = np.flatnonzero(shares)
+            index, bounds, shares = index.take(kept), np.searchsorted(kept, bounds), shares.take(kept)
+        points = self.points if np.array_equal(index, np.arange(len(self))) else self.points.take(index)
+        # 3. The images that they are compared with, and the motion around these.
+        motions, biases = _Motions.of(self, pairs, state), state.biases_of(self.number)
+        classes = [self.classes[g] for g in chosen]
+        paired = PairedEdges(
+            drive.camera,
+            points,
+            self._owners(chosen, index, bounds),
+            bounds,
+            [drive.images[pairs[p].image].contours[c] for p, c in zip(group_pairs, classes, strict=True)],
+            motions.of_images(group_pairs if len(set(group_pairs)) > 1 else group_pairs[0]),
+            base_taus_s.repeat(np.diff(bounds)) - points.offsets_s,
+            np.array([biases.get(c, 0.0) for c in classes]),
+            self._velocities(index),
+        )
         return _PairedAtState(pairs, chosen, group_pairs, motions, paired, index, shares)
 
     def pairs(self, time_offset_s: float) -> list[Pair]:
@@ -384,40 +398,17 @@ class DriveEdges:
             return pair_every_image(*stamps, time_offset_s, EVERY_IMAGE_REACH * drive.lidar_period_s)
         return pair_by_time(*stamps, time_offset_s, drive.image_period_s)
 
-    def _paired(
-        self, groups: Sequence[tuple[int, int]], pairs: Sequence[Pair], motions: _Motions, state: State
-    ) -> tuple[PairedEdges, IntArray]:
-        """The points of groups with their pairs' images, and which of all points they are."""
-        drive, biases = self.drive, state.biases_of(self.number)
-        spans = [(int(self.bounds[g]), int(self.bounds[g + 1])) for g, _ in groups]
-        bounds = np.cumsum([0, *(b - a for a, b in spans)])
-        whole = [g for g, _ in groups] == list(range(len(self.scans)))
-        index = np.concatenate([np.arange(a, b) for a, b in spans])
-        points = self.points if whole else self.points.take(index)
-        velocities = self.velocities if whole or self.velocities is None else self.velocities[index]
-        if velocities is not None and not velocities.any():
-            velocities = None
-        classes = [self.classes[g] for g, _ in groups]
-        base_taus_s = np.array([pairs[p].base_tau_s for _, p in groups])
-        paired = PairedEdges(
-            drive.camera,
-            points,
-            self.owners if whole else self._owners(groups, index),
-            bounds,
-            [drive.images[pairs[p].image].contours[c] for (_, p), c in zip(groups, classes, strict=True)],
-            [motions.of_images[p] for _, p in groups],
-            np.repeat(base_taus_s, np.diff(bounds)) - points.offsets_s,
-            np.array([biases.get(c, 0.0) for c in classes]),
-            velocities,
-        )
-        return paired, index
-
-    def _owners(self, groups: Sequence[tuple[int, int]], index: IntArray) -> IntArray:
+    def _owners(self, chosen: Sequence[int], index: IntArray, bounds: IntArray) -> IntArray:
         """(n,) numbers of the objects of some points; an object in two images counts as two."""
-        chosen = np.array([g for g, _ in groups])
-        nth = np.arange(len(chosen)) - np.searchsorted(chosen, chosen)
-        counts = np.diff(self.bounds)[chosen]
-        return np.asarray(self.owners[index] + np.repeat(nth, counts) * (int(self.owners.max()) + 1))
+        owners, nth = self.owners.take(index), np.arange(len(chosen)) - np.searchsorted(chosen, chosen)
+        if not nth.any():
+            return owners
+        return np.asarray(owners + nth.repeat(np.diff(bounds)) * (int(self.owners.max()) + 1))
+
+    def _velocities(self, index: IntArray) -> FloatArray | None:
+        """(n, 3) of the objects of some points; None where all are static."""
+        velocities = None if self.velocities is None else self.velocities.take(index, axis=0)
+        return None if velocities is None or not velocities.any() else velocities
 
 
 @dataclass(frozen=True)
@@ -425,13 +416,14 @@ class _Motions:
     """The motion around the images of pairs.
 
     Attributes:
-        of_images: the camera's.
+        c_twists, c_accelerations: (p, 6) the camera's [rad/s, m/s].
         l_twists: the LiDAR's, or None without odometry.
         measured: (p, 6) the LiDAR's as measured; zeros without odometry [rad/s, m/s].
         since_s: (p,) stamps of the images minus that of the drive's first [s].
     """
 
-    of_images: Sequence[CameraTwist]
+    c_twists: FloatArray
+    c_accelerations: FloatArray
     l_twists: TwistSamples | None
     measured: FloatArray
     since_s: FloatArray
@@ -446,15 +438,18 @@ class _Motions:
         since_s = np.array([stamp - origin_ns for stamp in stamps]) * 1e-9
         l_twists = edges.tracks.at_all(number, [stamp + shift_ns for stamp in stamps])
         if l_twists is None:
-            rest = CameraTwist(np.zeros(6), np.zeros(6))
-            return cls([rest] * len(pairs), None, np.zeros((len(pairs), 6)), since_s)
+            rest = np.zeros((len(pairs), 6))
+            return cls(rest, rest, None, rest, since_s)
         measured = l_twists.twists
         l_twists = moved_twists(
             l_twists, state.nuisances, Scene(drive.camera, measured, 0.0, drive.scan_period_s)
         )
         Ad = np.asarray(state.cTl.AdjointMap())
-        rows = zip(l_twists.twists @ Ad.T, l_twists.accelerations @ Ad.T, strict=True)
-        return cls([CameraTwist(*row) for row in rows], l_twists, measured, since_s)
+        return cls(l_twists.twists @ Ad.T, l_twists.accelerations @ Ad.T, l_twists, measured, since_s)
+
+    def of_images(self, pairs: int | Sequence[int]) -> CameraTwist:
+        """The camera's around the image of one pair, or by rows (g, 6) around those of some."""
+        return CameraTwist(self.c_twists[pairs], self.c_accelerations[pairs])
 
     def scene(self, drive: Drive, of: IntArray | int) -> Scene:
         """What assumptions depend on, of some of the pairs."""
@@ -494,9 +489,9 @@ class DriveMatches:
         pairs: all pairs, also those without a match.
         motions: around their images.
         found: the matches, group by group.
-        group_pairs, group_classes: pair and class of each group.
-        points: (m,) which of the drive's points each match is, and
-        places: (m,) which of the points of its scan and class each match is.
+        groups: which of the drive's groups each is, and
+        group_pairs: its pair.
+        points: (m,) which of the drive's points each match is.
         cTl, time_offset_s: extrinsic and time offset that the matches were made at.
     """
 
@@ -504,10 +499,9 @@ class DriveMatches:
     pairs: Sequence[Pair]
     motions: _Motions
     found: EdgeMatches
+    groups: Sequence[int]
     group_pairs: IntArray
-    group_classes: Sequence[SemanticClass]
     points: IntArray
-    places: IntArray
     cTl: gtsam.Pose3
     time_offset_s: float
 
@@ -530,6 +524,16 @@ class DriveMatches:
         return np.diff(self.found.bounds)
 
     @cached_property
+    def group_classes(self) -> list[SemanticClass]:
+        """Class of each group."""
+        return [self.edges.classes[g] for g in self.groups]
+
+    @cached_property
+    def places(self) -> IntArray:
+        """(m,) which of the points of its scan and class each match is."""
+        return self.points - self.edges.bounds[list(self.groups)].repeat(self.counts)
+
+    @cached_property
     def pair_of(self) -> IntArray:
         """(m,) number of each match's pair."""
         return np.repeat(self.group_pairs, self.counts)
@@ -539,10 +543,10 @@ class DriveMatches:
         """Numbers of the pairs that have matches."""
         return list(np.unique(self.pair_of).tolist())
 
-    @cached_property
+    @property
     def c_twists(self) -> FloatArray:
         """(p, 6) of the camera at the image of each pair [rad/s, m/s]."""
-        return np.stack([motion.c_twist for motion in self.motions.of_images])
+        return self.motions.c_twists
 
     @cached_property
     def tracks(self) -> IntArray | None:
@@ -567,12 +571,10 @@ class DriveMatches:
         """(drive, class, track) of every object with a mask bias of its own."""
         if self.tracks is None:
             return set()
-        spans = pairwise(self.found.bounds.tolist())
-        return {
-            (self.number, c, track)
-            for c, (a, b) in zip(self.group_classes, spans, strict=True)
-            for track in np.unique(self.tracks[a:b]).tolist()
-        }
+        tracks, first = np.unique(self.tracks, return_index=True)
+        groups = np.searchsorted(self.found.bounds, first, side="right") - 1
+        found = zip(groups.tolist(), tracks.tolist(), strict=True)
+        return {(self.number, self.group_classes[g], track) for g, track in found}
 
     @cached_property
     def terms(self) -> dict[str, FloatArray]:
@@ -598,7 +600,7 @@ class DriveMatches:
         return [self._pair(p, own) for p, own in groups.items()]
 
     def _pair(self, p: int, groups: Mapping[SemanticClass, tuple[slice, int]]) -> PairMatches:
-        objects, motion = self.edges.points.objects, self.motions.of_images[p]
+        objects, motion = self.edges.points.objects, self.motions.of_images(p)
         l_twists, tracks = self.motions.l_twists, self.tracks
         return PairMatches(
             self.number,

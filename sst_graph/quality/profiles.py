@@ -110,8 +110,8 @@ def score_profiles(
 
 def _with_motion_in(other: FloatArray, paired: PairedEdges) -> PairedEdges:
     """The pairs with the motion of another camera on the vehicle; other: (6, 6) adjoint map to its frame."""
-    motions = [CameraTwist(other @ each.c_twist, other @ each.c_acceleration) for each in paired.motions]
-    return replace(paired, motions=motions)
+    motion = paired.motion
+    return replace(paired, motion=CameraTwist(motion.c_twist @ other.T, motion.c_acceleration @ other.T))
 
 
 def _near_view(paired: PairedEdges, cTl: gtsam.Pose3, time_offset_s: float) -> PairedEdges:

@@ -67,7 +67,7 @@ def measure_points(
 
 
 def _frame(own: DriveMatches, p: int) -> MatchedFrame:
-    pair, motion, drive = own.pairs[p], own.motions.of_images[p], own.edges.drive
+    pair, motion, drive = own.pairs[p], own.motions.of_images(p), own.edges.drive
     return MatchedFrame(
         drive.name,
         drive.scans[pair.scan].index,

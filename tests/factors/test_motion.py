@@ -128,10 +128,9 @@ def test_derivatives_at_100_points(model, rigid, speed, objects):
     motion = CameraTwist(twist, acceleration)
     point = move_points(cTl, lPs, time_offset_s + base, motion, model, velocities)
     g = np.broadcast_to(np.eye(3)[:, :, None], (3, 3, 100)).copy()
-    lifted = rigid and not objects
-    rows = np.empty((6 if lifted else 13, 3, 100))
+    rows = np.empty((point.lift.shape[1] if rigid else 13, 3, 100))
     point.write_rows(g, rows)
-    J = np.tensordot(point.lift, rows, axes=1) if lifted else rows
+    J = np.tensordot(point.lift, rows, axes=1) if rigid else rows
     for column in range(13):
         step = 1e-4 * np.eye(13)[column]
         coarse, fine = (cPs(step) - cPs(-step)) / 2e-4, (cPs(step / 2) - cPs(-step / 2)) / 1e-4
@@ -140,7 +139,8 @@ def test_derivatives_at_100_points(model, rigid, speed, objects):
         np.testing.assert_allclose(J[column] / scale, numerical / scale, atol=1e-6)
 
 
-def test_groups_move_as_their_points_do_each_with_its_own_tau_and_image():
+@pytest.mark.parametrize("objects", [False, True])
+def test_groups_move_as_their_points_do_each_with_its_own_tau_and_image(objects: bool):
     rng = np.random.default_rng(13)
     bounds, cTl = np.array([0, 4, 4, 9]), gtsam.Pose3.Expmap(rng.normal(size=6))  # the second has none
     counts, taus_s = np.diff(bounds), np.array([0.13, -0.2, 0.05])
@@ -148,13 +148,15 @@ def test_groups_move_as_their_points_do_each_with_its_own_tau_and_image():
     lPs, g = rng.normal(0.0, 10.0, (3, 9)), rng.normal(size=(3, 2, 9))
     groups = CameraTwist(twists, accelerations)
     each = CameraTwist(*(np.repeat(rows, counts, axis=0).T for rows in (twists, accelerations)))
-    single = move_points(cTl, lPs, np.repeat(taus_s, counts), each)
-    moved = move_groups(cTl, lPs, bounds, taus_s, groups)
+    velocities = rng.normal(0.0, 10.0, (3, 9)) if objects else None
+    single = move_points(cTl, lPs, np.repeat(taus_s, counts), each, l_velocities=velocities)
+    moved = move_groups(cTl, lPs, bounds, taus_s, groups, velocities)
     np.testing.assert_allclose(moved.cPs, single.cPs, rtol=1e-12, atol=1e-12)
-    by_pose = transformed(group_poses(cTl, taus_s, groups), lPs, bounds)
-    np.testing.assert_allclose(by_pose, single.cPs, rtol=1e-12, atol=1e-12)
-    expected, wrenches = np.empty((13, 2, 9)), np.empty((6, 2, 9))
+    if not objects:
+        by_pose = transformed(group_poses(cTl, taus_s, groups), lPs, bounds)
+        np.testing.assert_allclose(by_pose, single.cPs, rtol=1e-12, atol=1e-12)
+    expected, rows = np.empty((13, 2, 9)), np.empty((moved.lift.shape[2], 2, 9))
     single.write_rows(g, expected)
-    moved.write_rows(g, wrenches)
+    moved.write_rows(g, rows)
     lifts = np.repeat(moved.lift, counts, axis=0)
-    np.testing.assert_allclose(np.einsum("nij,jkn->ikn", lifts, wrenches), expected, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(np.einsum("nij,jkn->ikn", lifts, rows), expected, rtol=1e-10, atol=1e-10)

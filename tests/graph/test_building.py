@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from streets import prepared_street, standing_street
 
 from sst_graph.factors import RobustKernel
 from sst_graph.graph.building import PRIOR_ROTATION_SIGMA_RAD, joint_graph, state_from, tracked_objects
-from sst_graph.graph.matching import GraphConfig, PairMatches, Tracks, associate
+from sst_graph.graph.matching import GraphConfig, PairMatches, Tracks, associate, edges_of, match_all
 from sst_graph.graph.state import EXTRINSIC, State, bias_key, object_bias_key, time_offset_key, twist_key
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.types import SemanticClass
@@ -54,6 +56,19 @@ def test_part_of_the_way_to_another_state() -> None:
     # A bias that was not known before is taken over.
     assert way.object_biases_px == {(0, 7): 1.25, (0, 8): 5.0}
     assert here.towards(there, 1.0) is there
+
+
+def test_matches_know_their_boundary_points_beside_objects_of_unknown_speed() -> None:
+    source, drive = standing_street(0.0), prepared_street(0.0)
+    edges = edges_of([drive], Tracks([drive]), CONFIG)
+    fast = np.where(np.isin(edges[0].owners, np.unique(edges[0].owners)[::2]), 30.0, 0.0)
+    away = State(source.truth.cTl, (0.01,))
+    (matches,) = match_all([replace(edges[0], unknown_mps=fast)], away, RobustKernel("geman_mcclure", 3.0))
+    assert not fast[matches.points].any() and (matches.places < matches.points).any()
+    for pair in matches.by_pair():
+        for c, found in pair.matches.items():
+            points = drive.scans[pair.pair.scan].boundaries[c]
+            np.testing.assert_array_equal(points.lPs[found.index], found.alignment.lPs)
 
 
 @pytest.mark.parametrize("by_object", [False, True])
