@@ -23,9 +23,11 @@ from sst_graph.association.edge_matching import (
     MIN_OBJECT_SHARE,
     SIDE_OF,
     SIDES,
+    TOP,
     EdgeMatches,
     MatchConfig,
     PairedEdges,
+    level_sigmas,
 )
 from sst_graph.association.nearest import ClassView, NearestMatches, frozen
 from sst_graph.factors import Alignment, PinholeCamera, RobustKernel, Vector, custom_factor
@@ -39,7 +41,7 @@ except ImportError as error:
     raise SystemExit("numba is missing: pip install 'sst-graph[bench]'") from error
 
 FloatArray = NDArray[np.float64]
-_BOTTOM = int(BOTTOM)
+_TOP, _BOTTOM = int(TOP), int(BOTTOM)
 
 
 def _camera(camera: PinholeCamera) -> FloatArray:
@@ -337,7 +339,7 @@ def _at(field: FloatArray, start: int, rows: int, columns: int, u: float, v: flo
 
 @njit(cache=True)
 def _match(
-    points: tuple[FloatArray, FloatArray, NDArray[np.uint8], NDArray[np.int64]],
+    points: tuple[FloatArray, FloatArray, NDArray[np.uint8], NDArray[np.int64], NDArray[np.int64]],
     bounds: NDArray[np.int64],
     poses: tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray],
     fields: tuple[FloatArray, NDArray[np.uint8], NDArray[np.int64]],
@@ -346,7 +348,7 @@ def _match(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray, NDArray[np.int64]]:
     """Numbers and sides (m,) of the matches, their pixel, normal, sigma, weight (m, 6), and points in view by
     group."""
-    lPs, outward, edges, owners = points
+    lPs, outward, edges, owners, rings = points
     R0, t0, taus, twists, accelerations = poses
     distance, unknown, boxes = fields
     camera, (gate, mask_sigma, side_sigma, lower_sigma, min_share), side_of = setting
@@ -401,16 +403,24 @@ def _match(
             found[m, 0], found[m, 1], found[m, 2], found[m, 3] = foot_x, foot_y, gx, gy
             found[m, 4] = np.hypot(mask_sigma, 0.5 * far * cosine / np.sqrt(3.0))
             m += 1
-    information, kept = np.zeros(4 * count), 0
+    layers = rings.max() + 1
+    information, of_rings, kept = np.zeros(4 * count), np.zeros(4 * count * layers), 0
     for k in range(m):
         owner = owners[index[k]]
         if met[owner] >= min_share * seen[owner]:
             index[kept], sides[kept], found[kept] = index[k], sides[k], found[k]
-            information[4 * owner + sides[kept]] += found[kept, 4] ** -2.0
+            side, own = 4 * owner + sides[kept], found[kept, 4] ** -2.0
+            information[side] += own
+            of_rings[side * layers + rings[index[kept]]] += own
             kept += 1
     for k in range(kept):
+        side = 4 * owners[index[k]] + sides[k]
         shared = lower_sigma if sides[k] == _BOTTOM else side_sigma
-        found[k, 5] = 1.0 / (1.0 + information[4 * owners[index[k]] + sides[k]] * shared**2)
+        total = information[side] * shared**2
+        if sides[k] >= _TOP:
+            sampling = found[k, 4] ** 2 - mask_sigma**2
+            total += of_rings[side * layers + rings[index[k]]] * sampling
+        found[k, 5] = 1.0 / (1.0 + total)
     return index[:kept], sides[:kept], found[:kept], in_view
 
 
@@ -421,13 +431,15 @@ class CompiledEdges:
         assert SIDES == 4 and paired.velocities is None
         maps = [contour for contour in paired.contours if isinstance(contour, ContourMap)]
         assert len(maps) == len(paired.contours) and all(each.stretch is None for each in maps)
-        self._paired, self._kernel = paired, kernel
+        self._paired, self._kernel, self._config = paired, kernel, config
         points, starts = paired.points, [min(a, len(paired.points) - 1) for a, _ in paired.spans]
         assert all((paired.base_taus_s[a:b] == paired.base_taus_s[a:b][:1]).all() for a, b in paired.spans)
-        self._points = points.lPs, points.outward, points.edges, paired.owners
+        rings = points.rings.astype(np.int64)
+        self._points = points.lPs, points.outward, points.edges, paired.owners, rings
         self._bounds, self._base_taus_s = paired.bounds, paired.base_taus_s[starts]
-        self._twists = np.stack([motion.c_twist for motion in paired.motions])
-        self._accelerations = np.stack([motion.c_acceleration for motion in paired.motions])
+        motion, shape = paired.motion, (len(paired.contours), 6)
+        self._twists = np.array(np.broadcast_to(motion.c_twist, shape))
+        self._accelerations = np.array(np.broadcast_to(motion.c_acceleration, shape))
         distances = [np.asarray(each.distance) for each in maps]
         firsts = np.cumsum([0, *(each.size for each in distances)])[:-1]
         self._fields = (
@@ -465,7 +477,8 @@ class CompiledEdges:
             c_acceleration=np.repeat(self._accelerations, np.diff(bounds), axis=0),
             weights=found[:, 5],
         )
-        return EdgeMatches(index, sides, alignment, bounds, seen)
+        level_px = level_sigmas(sides, found[:, 4], self._config)
+        return EdgeMatches(index, sides, alignment, bounds, seen, np.ones(len(index)), level_px)
 
 
 @njit(cache=True)
