@@ -416,7 +416,7 @@ def move_groups(
     """
     taus, xis = taus_s[:, None], _group_xis(taus_s, motion)
     poses = [gtsam.Pose3.Expmap(xi) * cTl for xi in xis]
-    left = np.array([gtsam.Pose3.ExpmapDerivative(xi) for xi in -xis])  # as se3_left_jacobian
+    left = np.array([se3_left_jacobian(xi) for xi in xis])
     rates = motion.c_twist - taus * motion.c_acceleration
     matrices, c_velocities = np.array([pose.matrix() for pose in poses]), None
     if l_velocities is not None:

@@ -74,7 +74,8 @@ def with_motion(
         turning = config.assumptions.turning_motion
         if weak or rolling or turning:
             why = "the labels alone leave directions open" if weak else "the scans are rolling sweeps"
-            why = f"the motion takes {' and '.join(turning)} for zero" if turning else why
+            if turning:
+                why = f"the motion takes {' and '.join(turning)} for zero"
             return WithMotion(labels, diagnostics={"left_out": why})
     return fuse_motion(problem, labels, stretches)
 

@@ -107,7 +107,7 @@ class SensorTwists:
         known = self._motions[start : end + 1]
         means = np.array([motion.mean_twist for motion in known])[around]
         h = np.array([motion.seconds for motion in known])[around][..., None]
-        covariances = np.array([motion.covariance for motion in known])[around[:, 1]]
+        covariances = np.array([_covariance(motion) for motion in known])[around[:, 1]]
         before = (means[:, 1] - means[:, 0]) / (h[:, 0] + h[:, 1])
         after = (means[:, 2] - means[:, 1]) / (h[:, 1] + h[:, 2])
         inner = (numbers > 0) & (numbers < last)
@@ -117,7 +117,7 @@ class SensorTwists:
         twists = means[:, 1] - 0.25 * h[:, 1] ** 2 * third
         rates = 2.0 * before + third * (2.0 * h[:, 0] + h[:, 1])
         twists[still], rates[still] = 0.0, 0.0
-        return twists, rates, covariances / h[:, 1, :, None] ** 2
+        return twists, rates, covariances
 
 
 _AXES = np.arange(6)

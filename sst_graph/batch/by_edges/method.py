@@ -20,12 +20,7 @@ from sst_graph.batch.by_edges.optimum import (
     starts_steps,
 )
 from sst_graph.batch.by_edges.problem import LabelEstimate, checking_motion, edges_problem, motion_alone
-from sst_graph.batch.by_edges.reasons import (
-    EdgeContrast,
-    edge_contrast,
-    edges_reasons,
-    with_lens_reasons,
-)
+from sst_graph.batch.by_edges.reasons import EdgeContrast, edge_contrast, edges_reasons, with_lens_reasons
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import MethodEstimate, frames_used
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate, MatchedDrives

@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 
 from sst_graph.batch.by_edges.problem import EdgesProblem
-from sst_graph.batch.by_edges.reasons import SCORE_WORK
+from sst_graph.batch.by_edges.reasons import SCORE_WORK, unsettled_reasons
 from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX, WIDER_KERNEL_PX, solution_steps
 from sst_graph.drive.preparation import Progress
 from sst_graph.edges.agreement import score
@@ -52,9 +52,6 @@ _MAX_ROUNDS = 10
 """Most times that the near scales are gone through."""
 CONVERGED_STEP = np.array([*np.radians([0.02] * 3), 0.005, 0.005, 0.005, 0.003])
 """(7,) a round that moves by no more is the last [rad, m, s]."""
-_SETTLED_STEP = np.array([*np.radians([0.1] * 3), 0.025, 0.025, 0.025, 0.015])
-"""(7,) farther apart, two solutions are not one optimum [rad, m, s]: right ones came back to within 0.01 deg,
-false ones ended 0.4 deg away."""
 
 
 def starts_steps(problem: EdgesProblem) -> Stepwise[list[State]]:
@@ -177,18 +174,7 @@ def farther_edges_steps(
     """
     wider = yield from solution_steps(problem, estimate, WIDER_KERNEL_PX)
     step = difference(estimate, wider.state)
-    if (np.abs(step) <= _SETTLED_STEP).all():
+    if not unsettled_reasons(step):
         return step, ()
     again = yield from _converged(problem, wider.state, None)
     return step, unsettled_reasons(difference(estimate, again.state))
-
-
-def unsettled_reasons(step: FloatArray) -> tuple[str, ...]:
-    """Why an estimate may be wrong from which an optimum nearby lies by a step (7,)."""
-    if (np.abs(step) <= _SETTLED_STEP).all():
-        return ()
-    return (
-        "solved again with edges farther away, and from there with near ones, the estimate ends "
-        f"{np.degrees(np.linalg.norm(step[:3])):.2f} deg, {100.0 * np.linalg.norm(step[3:6]):.1f} cm and "
-        f"{1e3 * step[6]:+.1f} ms away: it has not settled on one set of edges",
-    )

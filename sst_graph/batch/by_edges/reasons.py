@@ -35,6 +35,9 @@ MAX_MOTION_CHI2 = 33.0
 contradict."""
 _FLOOR = np.array([*np.radians([0.5] * 3), 0.005])
 """Added to the sigmas of that difference [rad, s]."""
+_SETTLED_STEP = np.array([*np.radians([0.1] * 3), 0.025, 0.025, 0.025, 0.015])
+"""(7,) farther apart, two solutions are not one optimum [rad, m, s]: right ones came back to within 0.01 deg,
+a false one ended 0.4 deg away."""
 MAX_FROM_GUESS_M = 0.35
 """Farthest that an estimate may lie from the guess: it is bound to it [m]."""
 
@@ -90,6 +93,17 @@ def contrast_of(own: float, around: Sequence[float], other: float) -> EdgeContra
     """
     spread = float(np.std(around)) + 1e-9
     return EdgeContrast(own, (own - float(np.mean(around))) / spread, own / max(max(around), 1e-9), other)
+
+
+def unsettled_reasons(step: FloatArray) -> tuple[str, ...]:
+    """Why an estimate may be wrong from which an optimum nearby lies by a step (7,)."""
+    if (np.abs(step) <= _SETTLED_STEP).all():
+        return ()
+    return (
+        "solved again with edges farther away, and from there with near ones, the estimate ends "
+        f"{np.degrees(np.linalg.norm(step[:3])):.2f} deg, {100.0 * np.linalg.norm(step[3:6]):.1f} cm and "
+        f"{1e3 * step[6]:+.1f} ms away: it has not settled on one set of edges",
+    )
 
 
 def edges_reasons(

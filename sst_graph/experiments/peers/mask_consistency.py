@@ -24,7 +24,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from sst_graph.experiments.peers.frames import PeerFrame, PeerProblem, moved_by
-from sst_graph.types import FloatArray, IntArray, SemanticClass
+from sst_graph.odometry.lidar import GROUND_CLASSES
+from sst_graph.types import FloatArray, IntArray
 
 _NORMALS_OF = 40
 """Neighbours of a normal: the original's."""
@@ -162,7 +163,7 @@ def _segmented(frame: PeerFrame) -> tuple[IntArray, FloatArray, IntArray, IntArr
     normals = np.linalg.eigh(off.transpose(0, 2, 1) @ off)[1][:, :, 0]
     directions = np.argmax(np.abs(normals @ _AXES.T), axis=1)
     # The ground, and clusters of all points that are not on it.
-    standing = np.flatnonzero(~np.isin(frame.classes[ahead], (SemanticClass.GROUND, SemanticClass.TERRAIN)))
+    standing = np.flatnonzero(~np.isin(frame.classes[ahead], GROUND_CLASSES))
     segments = np.zeros(len(frame.lPs), dtype=np.intp)
     if len(standing):
         pairs = cKDTree(frame.lPs[ahead[standing]]).query_pairs(_CLUSTER_M, output_type="ndarray")
@@ -170,7 +171,7 @@ def _segmented(frame: PeerFrame) -> tuple[IntArray, FloatArray, IntArray, IntArr
         labels = connected_components(links, directed=False)[1]
         large = np.bincount(labels)[labels] >= _CLUSTER_POINTS
         segments[ahead[standing]] = np.where(large, labels + 2, 0)
-    ground = np.isin(frame.classes, (SemanticClass.GROUND, SemanticClass.TERRAIN))
+    ground = np.isin(frame.classes, GROUND_CLASSES)
     segments[ground] = 1
     used, numbers = np.unique(segments[some], return_inverse=True)
     # Numbered without gaps: most clusters are too small to count.

@@ -24,11 +24,7 @@ from sst_graph.batch.by_edges.covariance import (
 )
 from sst_graph.batch.by_edges.optimum import farther_edges_steps
 from sst_graph.batch.by_edges.problem import KnownCalibration
-from sst_graph.batch.by_edges.reasons import (
-    contrast_reasons,
-    edge_contrast_steps,
-    far_reasons,
-)
+from sst_graph.batch.by_edges.reasons import contrast_reasons, edge_contrast_steps, far_reasons
 from sst_graph.covariance.shared_errors import spread_covariance
 from sst_graph.graph.matching import Tracks, edges_of
 from sst_graph.graph.outer_loop import JointProblem
