@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from sst_graph.features.ground import heights_above_ground, on_ground
 from sst_graph.features.lidar_beams import Beams, arrange_beams
+from sst_graph.features.up import levelled, up_direction
 from sst_graph.types import FloatArray, IntArray
 
 _APART_M = 0.4
@@ -63,14 +64,15 @@ def find_compact_objects(points: FloatArray, rings: NDArray[np.integer] | None) 
     """Ground removed, the rest split into objects, each judged by its size.
 
     Args:
-        points: (n, 3) in the LiDAR frame, z up [m].
+        points: (n, 3) in the LiDAR frame [m].
         rings: (n,) laser of each point, or None.
     """
     n = len(points)
     if n == 0:
         return CompactObjects(np.zeros(0, np.intp), np.zeros(1, np.uint8), np.zeros(0))
     # 1. The ground.
-    heights = heights_above_ground(points)
+    level = levelled(points, up_direction(points))
+    heights = heights_above_ground(level)
     raised = ~on_ground(heights) & (heights < _MAX_HEIGHT_M)
     # 2. Neighbours that are near each other.
     a, b = _linked(points, raised, arrange_beams(points, rings))
@@ -82,7 +84,7 @@ def find_compact_objects(points: FloatArray, rings: NDArray[np.integer] | None) 
     kept = counts >= _MIN_POINTS
     kept[0] = False
     numbers = np.where(kept, np.cumsum(kept), 0)[labels]
-    return CompactObjects(numbers, _kinds(points, heights, numbers), heights)
+    return CompactObjects(numbers, _kinds(level, heights, numbers), heights)
 
 
 def _linked(points: FloatArray, raised: NDArray[np.bool_], beams: Beams) -> tuple[IntArray, IntArray]:

@@ -36,24 +36,15 @@ lower returns came by way of a mirror."""
 
 
 def heights_above_ground(points: FloatArray) -> FloatArray:
-    """(n,) height of points (n, 3), in the LiDAR frame with z up, above the ground below them [m]."""
+    """(n,) height of points (n, 3), in axes with z up, above the ground below them [m]."""
     if len(points) == 0:
         return np.zeros(0)
     # 1. The plane that fits the lowest points of all cells.
-    cells = _cells(points)
-    size = int(2.0 * _REACH_M / _CELL_M)
-    # By cell, then by height: one key is sorted much faster than two.
-    order = np.argsort(cells * (np.ptp(points[:, 2]) + 1.0) + points[:, 2])
-    first = np.flatnonzero(np.diff(cells[order], prepend=-1))
-    counts = np.diff(first, append=len(order))
-    lowest = order[first + (_LOWEST_SHARE * counts).astype(np.intp)]
-    believed = counts >= _MIN_POINTS
-    if not believed.any():
-        believed[:] = True
-    plane = _plane(points[lowest[believed]])
+    cells, size = _cells(points), int(2.0 * _REACH_M / _CELL_M)
+    lowest = lowest_of_cells(points, cells)
+    plane = fitted_plane(points[lowest])
     heights = points[:, 2] - points[:, :2] @ plane[:2] - plane[2]
     # 2. The lower envelope of the cells' lowest heights above it.
-    lowest = lowest[believed]
     rho = np.sqrt(points[lowest, 0] ** 2 + points[lowest, 1] ** 2)
     lowest = lowest[heights[lowest] > -(_DEEPEST_M + _DEEPEST_SLOPE * rho)]
     floor = np.full(size * size, 1e3, np.float32)
@@ -63,6 +54,24 @@ def heights_above_ground(points: FloatArray) -> FloatArray:
     beside = cv2.erode(envelope, np.ones((3, 3), np.uint8)).reshape(-1)
     envelope = np.where(envelope.reshape(-1) < floor, beside, envelope.reshape(-1))
     return np.asarray(heights - envelope[cells])
+
+
+def lowest_of_cells(points: FloatArray, cells: NDArray[np.intp] | None = None) -> NDArray[np.intp]:
+    """Which points (n, 3) are the lowest of their cells, stray ones aside, where there are enough of them.
+
+    Args:
+        cells: (n,) number of each point's cell, where it is known.
+    """
+    if len(points) == 0:
+        return np.zeros(0, np.intp)
+    cells = _cells(points) if cells is None else cells
+    # By cell, then by height: one key is sorted much faster than two.
+    order = np.argsort(cells * (np.ptp(points[:, 2]) + 1.0) + points[:, 2])
+    first = np.flatnonzero(np.diff(cells[order], prepend=-1))
+    counts = np.diff(first, append=len(order))
+    lowest = order[first + (_LOWEST_SHARE * counts).astype(np.intp)]
+    believed = counts >= _MIN_POINTS
+    return np.asarray(lowest[believed] if believed.any() else lowest)
 
 
 def on_ground(heights_m: FloatArray) -> NDArray[np.bool_]:
@@ -79,7 +88,7 @@ def _cells(points: FloatArray) -> NDArray[np.intp]:
     return np.asarray(rows * size + columns)
 
 
-def _plane(lowest: FloatArray) -> FloatArray:
+def fitted_plane(lowest: FloatArray) -> FloatArray:
     """(3,) a, b, c of z = a x + b y + c through the ground among the lowest points (n, 3) of cells.
 
     The first plane is level, at the height below which a third of them lies: on a street most cells show the

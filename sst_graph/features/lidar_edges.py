@@ -10,7 +10,7 @@ return: a camera below the LiDAR sees the difference.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 
 import cv2
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.features.lidar_beams import Beams, arrange_beams
+from sst_graph.features.up import up_direction
 from sst_graph.types import FloatArray, IntArray, Scan, SemanticClass
 
 _BEHIND_M = 0.5
@@ -39,6 +40,8 @@ _MAX_SLOPE_M = 1.0
 _ROOF_RADIUS_M = 3.0
 """Radius of curvature of roofs seen from above [m]: a car's is 4 cm lower half a metre from its middle. What
 another radius and flat roofs cost: docs/measured/simulators.md."""
+_HALF_TURN = np.array([1.0, -1.0, -1.0])
+"""By this the coordinates are multiplied where the LiDAR is upside down: half a turn about its x axis."""
 _ROOF_BEAMS = 2
 """Beams to either side of a point on a roof that hit the object, too."""
 _CELL_M = 0.3
@@ -127,6 +130,10 @@ def find_boundaries(
     present = [c for c in classes if np.count_nonzero(members[c]) >= _MIN_POINTS]
     if not present:
         return {}
+    # Upside down, what the scan lines leave at the top is the ground: they are turned by half a turn.
+    up = up_direction(points)
+    turn = _HALF_TURN if up[2] < 0.0 else np.ones(3)
+    points, up = points * turn, up * turn
     beams = arrange_beams(points, None if scan.rings is None else scan.rings[usable])
     offsets = np.zeros(len(points)) if scan.offsets_s is None else scan.offsets_s[usable].astype(float)
     instances = None if scan.instances is None else scan.instances[usable]
@@ -143,8 +150,9 @@ def find_boundaries(
             _ring_edges(points, seen, beams, roofs=c == SemanticClass.VEHICLE),
         ]
         if with_lower_edges and c != SemanticClass.OBJECT:
-            parts.append(_ring_edges(points, seen, beams, _ground_heights(points, objects)))
-        found[c] = _collect(parts, beams.ring, offsets, objects, max_range_m)
+            parts.append(_ring_edges(points, seen, beams, _ground_below(points @ up, objects)))
+        edges = _collect(parts, beams.ring, offsets, objects, max_range_m)
+        found[c] = replace(edges, lPs=edges.lPs * turn, outward=edges.outward * turn)
     return {c: b for c, b in found.items() if len(b)}
 
 
@@ -163,6 +171,14 @@ class _Seen:
     inner: NDArray[np.bool_]
     behind_m: float = _BEHIND_M
     outline_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Ground:
+    """Heights above the LiDAR (n,) of all points, and of the ground below each point's object [m]."""
+
+    levels: FloatArray
+    lowest: FloatArray
 
 
 @dataclass(frozen=True)
@@ -231,7 +247,7 @@ def _ring_edges(
     points: FloatArray,
     seen: _Seen,
     beams: Beams,
-    ground: FloatArray | None = None,
+    ground: _Ground | None = None,
     roofs: bool = False,
 ) -> _Edges:
     """Edges towards the ring above: half way, at the object's range, to that ring's cone.
@@ -239,8 +255,8 @@ def _ring_edges(
     The one return of that ring that is nearest in azimuth decides. To require that two of them miss the
     object would prefer edges far from that ring, and so shift the mean by a tenth of the gap.
 
-    With the height (n,) [m] of the ground that each point's object stands on, edges towards the ring
-    below: the object ends where that ring meets the ground, no matter how far before or behind.
+    With the ground that each point's object stands on, edges towards the ring below: the object ends where
+    that ring meets the ground, no matter how far before or behind.
 
     Args:
         roofs: whether objects of the class have one: seen from above, they end where a ray touches it.
@@ -254,7 +270,7 @@ def _ring_edges(
     if ground is None:
         ok &= _is_behind(beams.rho, i, following, seen.behind_m)
     else:
-        ok &= points[following, 2] < ground[i] + _GROUND_MARGIN_M
+        ok &= ground.levels[following] < ground.lowest[i] + _GROUND_MARGIN_M
     i, following = i[ok], following[ok]
     # The two rays: height over range, from their cones' tips.
     rho, tip, tip_there = beams.rho[i], beams.height[beams.ring[i]], beams.height[ring[i]]
@@ -306,20 +322,20 @@ def _within_object(mask: NDArray[np.bool_], beams: Beams, index: IntArray) -> ND
     return within
 
 
-def _ground_heights(points: FloatArray, objects: IntArray) -> FloatArray:
-    """(n,) height of the lowest points of each point's object [m], few stray ones aside; -inf without one."""
-    heights = np.full(len(points), -np.inf)
+def _ground_below(levels: FloatArray, objects: IntArray) -> _Ground:
+    """The ground by the lowest points of each object, few stray ones aside; -inf where there is no object."""
+    heights = np.full(len(levels), -np.inf)
     some = np.flatnonzero(objects >= 0)
     if len(some) == 0:
-        return heights
-    z = points[some, 2]
+        return _Ground(levels, heights)
+    z = levels[some]
     # By object, then by height: one key is sorted much faster than two.
     order = some[np.argsort(objects[some] * (np.ptp(z) + 1.0) + z)]
     first = np.flatnonzero(np.diff(objects[order], prepend=-1))
     counts = np.diff(first, append=len(order))
-    lowest = points[order[first + (0.03 * counts).astype(np.intp)], 2]
+    lowest = levels[order[first + (0.03 * counts).astype(np.intp)]]
     heights[order] = np.repeat(lowest, counts)
-    return heights
+    return _Ground(levels, heights)
 
 
 def _nearest_in_ring(beams: Beams, index: IntArray, ring: IntArray) -> tuple[IntArray, NDArray[np.bool_]]:
