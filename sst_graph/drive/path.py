@@ -13,9 +13,6 @@ from sst_graph.types import FloatArray, IntArray, RelativeMotion
 
 _REACH = 2
 """Poses to either side of one that determine the twist there."""
-_INTERPOLATION_ERROR = 1.5
-"""Error between stamps over the distance of the two polynomials that are blended there: 1.5 where
-accelerations are white, 1.8 where a vehicle rocks as it stops, 0.1 for a sine of 1.5 Hz at 10 Hz."""
 _NODES = 2 * _REACH + 2
 """Most poses that a polynomial of an interval follows from."""
 
@@ -32,7 +29,6 @@ class PathSteps:
         covariance_rates: (m, 6, 6) its change as both ends move on in time [1/s]: between two stamps the
             noise of their poses is averaged, at a stamp it is not.
         twist_covariances: (m, 6, 6) of the rate at which aTb changes as both ends move on.
-        interpolation_covariances: (m, 6, 6) diagonal, of aTb by what is between the stamps and not known.
     """
 
     found: IntArray
@@ -42,7 +38,6 @@ class PathSteps:
     covariances: FloatArray
     covariance_rates: FloatArray
     twist_covariances: FloatArray
-    interpolation_covariances: FloatArray
 
     def __len__(self) -> int:
         return len(self.found)
@@ -60,8 +55,7 @@ class SensorPath:
     Each blends the polynomials through five poses around the interval's two ends (in the manner of
     Overhauser, who blends parabolas), so that twists are continuous, too. Parabolas would be 15 % short of
     the rate of a pitching at 1.5 Hz that is seen at 10 Hz; these are 3 % short. None is known across a motion
-    that failed, or beyond the ends. The error of the blend is estimated by the distance of the two that are
-    blended, as embedded formulas of Runge and Kutta estimate theirs.
+    that failed, or beyond the ends.
     """
 
     def __init__(self, motions: Sequence[RelativeMotion]) -> None:
@@ -84,7 +78,7 @@ class SensorPath:
         intervals = self._intervals(stamps)
         if intervals[0] < 0:
             return None
-        poses, twists, *_ = self._interpolated(intervals, stamps)
+        poses, twists, _ = self._interpolated(intervals, stamps)
         return gtsam.Pose3(poses[0]), twists[0]
 
     def steps(self, from_ns: NDArray[np.int64], to_ns: NDArray[np.int64]) -> PathSteps:
@@ -96,7 +90,7 @@ class SensorPath:
         # Each time once: mostly, one step ends where the next begins.
         times, place = np.unique(np.concatenate([from_ns[found], to_ns[found]]), return_inverse=True)
         place = place.reshape(2, n)
-        poses, twists, weights, apart = self._interpolated(self._intervals(times), times)
+        poses, twists, weights = self._interpolated(self._intervals(times), times)
         # Every pose errs by itself: what the step takes from each of them, and how that changes.
         oldest = np.maximum(np.array([first, last]) - _REACH, 0)
         ahead = oldest[1] - oldest[0]
@@ -119,7 +113,6 @@ class SensorPath:
             of_pose * products[:, 0, 0, None, None],
             of_pose * (2.0 * products[:, 0, 1, None, None]),
             of_pose * products[:, 1, 1, None, None],
-            _beyond_noise(apart[place] ** 2).sum(axis=0)[:, :, None] * np.eye(6),
         )
 
     def _intervals(self, stamps_ns: NDArray[np.int64]) -> IntArray:
@@ -133,13 +126,12 @@ class SensorPath:
 
     def _interpolated(
         self, intervals: IntArray, stamps_ns: NDArray[np.int64]
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """(n, 4, 4) poses, (n, 6) twists, (n, _NODES, 2) weights of the poses from the oldest one around the
-        interval on, with the weights' derivatives [1/s], and (n, 6) differences of the two that are
-        blended, at times (n,) in intervals (n,).
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """(n, 4, 4) poses, (n, 6) twists, and (n, _NODES, 2) weights of the poses from the oldest one
+        around the interval on, with the weights' derivatives [1/s], at times (n,) in intervals (n,).
         """
         if not len(stamps_ns):
-            return np.zeros((0, 4, 4)), np.zeros((0, 6)), np.zeros((0, _NODES, 2)), np.zeros((0, 6))
+            return np.zeros((0, 4, 4)), np.zeros((0, 6)), np.zeros((0, _NODES, 2))
         polynomials = [self._polynomial(i) for i in intervals.tolist()]
         seconds = (stamps_ns - self._stamps[intervals]) * 1e-9
         powers = seconds[:, None] ** np.arange(_NODES)
@@ -150,9 +142,7 @@ class SensorPath:
         starts = self._matrices[intervals]
         moved = np.array([gtsam.Pose3.Expmap(log).matrix() for log in logs])
         derivatives = np.array([gtsam.Pose3.ExpmapDerivative(log) for log in logs])
-        twists = (derivatives @ slopes[..., None])[..., 0]
-        apart = (powers[:, None] @ np.array([each.apart for each in polynomials]))[:, 0]
-        return starts @ moved, twists, np.swapaxes(weights, 1, 2), apart
+        return starts @ moved, (derivatives @ slopes[..., None])[..., 0], np.swapaxes(weights, 1, 2)
 
     def _mean_covariances(self, first: IntArray, last: IntArray) -> FloatArray:
         """(n, 6, 6) mean over the motions from the first to the last of each step."""
@@ -172,27 +162,13 @@ class SensorPath:
             ]
             times = (self._stamps[around] - self._stamps[i]) * 1e-9
             logs = [gtsam.Pose3.Logmap(self._poses[i].between(self._poses[k])) for k in around]
-            blended, apart = _blended(times, around.index(i))
+            blended = _blended(times, around.index(i))
             coefficients, inverse = np.zeros((_NODES, 6)), np.zeros((_NODES, _NODES))
             coefficients[: len(blended)] = blended @ np.stack(logs)
-            difference = np.zeros((_NODES, 6))
-            difference[: len(apart)] = apart @ np.stack(logs)
             oldest = around[0] - max(i - _REACH, 0)
             inverse[: len(blended), oldest : oldest + len(around)] = blended
-            self._polynomials[i] = _Polynomial(inverse, coefficients, difference)
+            self._polynomials[i] = _Polynomial(inverse, coefficients)
         return self._polynomials[i]
-
-
-def _beyond_noise(squared: FloatArray) -> FloatArray:
-    """(2, m, 6) squared errors of interpolation by squared differences of the polynomials that are blended.
-
-    Noise of the poses sets these apart all along a path, what a vehicle does between two stamps at some
-    times: off goes what one in twenty exceeds by the noise that the median tells (chi-squared of 1: 0.455).
-    """
-    if not squared.size:
-        return squared
-    by_noise = 3.84 / 0.455 * np.median(squared, axis=(0, 1))
-    return np.asarray(_INTERPOLATION_ERROR**2 * np.maximum(squared - by_noise, 0.0))
 
 
 @dataclass(frozen=True)
@@ -203,17 +179,15 @@ class _Polynomial:
         inverse: (_NODES, _NODES) from values at the poses from the oldest one around the interval on to
             coefficients by power of the seconds; 0 for poses that it does not follow from.
         coefficients: (_NODES, 6) of the logarithm in the frame of the interval's first pose.
-        apart: the same of the difference of the two that are blended; 0 where there is but one.
     """
 
     inverse: FloatArray
     coefficients: FloatArray
-    apart: FloatArray
 
 
-def _blended(times: FloatArray, first: int) -> tuple[FloatArray, FloatArray]:
+def _blended(times: FloatArray, first: int) -> FloatArray:
     """(m, m) from values at times (m,) to coefficients by power: the polynomials around both ends of an
-    interval, blended from one to the next; and to those of their difference.
+    interval, blended from one to the next.
 
     The interval lies between ``times[first]``, which is 0, and the time after it. An end that has poses to
     one side only has no polynomial of its own.
@@ -221,9 +195,8 @@ def _blended(times: FloatArray, first: int) -> tuple[FloatArray, FloatArray]:
     m = len(times)
     ends = [k for k in (first, first + 1) if 0 < k < m - 1]
     if not ends:
-        only = np.asarray(np.linalg.inv(np.vander(times, increasing=True)))
-        return only, np.zeros_like(only)
-    result, apart = np.zeros((2, max(m, _NODES), m))
+        return np.asarray(np.linalg.inv(np.vander(times, increasing=True)))
+    result = np.zeros((max(m, _NODES), m))
     for k in ends:
         reach = min(_REACH, k, m - 1 - k)
         nodes = np.arange(k - reach, k + reach + 1)
@@ -236,5 +209,4 @@ def _blended(times: FloatArray, first: int) -> tuple[FloatArray, FloatArray]:
         slope = (-1.0 if k == first else 1.0) / times[first + 1]
         result[np.ix_(powers, nodes)] += through * (1.0 if k == first else 0.0)
         result[np.ix_(powers + 1, nodes)] += through * slope
-        apart[np.ix_(powers, nodes)] += through * (1.0 if k == first else -1.0)
-    return result, apart
+    return result

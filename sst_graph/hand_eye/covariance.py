@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,18 +23,13 @@ from sst_graph.graph.state import State
 from sst_graph.hand_eye.graph import PRIOR_SIGMAS, CameraStep, HandEyeTerms
 from sst_graph.types import FloatArray
 
-TWIST_NOISE_MARGIN = 2.0
-"""Factor on the spurious information by noise of the twists, whose size is estimated from the same few
-motions."""
-BY_CHANCE_CHI2 = 5.99
-"""95 % quantile of chi-squared with 2 degrees of freedom."""
+NOISE_INFORMATION_MARGIN = 2.0
+"""Factor on the spurious information by noise, whose size is estimated from the same few motions."""
 MOST_TAKEN_OFF = 0.5
 """Largest fraction of the variance that may be subtracted for neighbouring scores that cancel: a few cancel
 by chance."""
 LEAST_INFORMATION = 1e-3
 """In any direction at least this part of the information remains, to keep it positive."""
-_AXES = 2
-"""Rotation about an axis turns vectors across it, which have two components."""
 _LAGS = 3
 """Neighbours up to this far apart may be correlated: a scan and an image end one pair and begin the next, and
 smoothing spreads errors a little farther. More lags make the estimate noisier."""
@@ -70,19 +66,16 @@ def hand_eye_covariance(
     """
     J, r = terms.linearized(state)
     cameras, directed = terms.pairs.cameras, terms.residuals.directed
-    by_camera = terms.roots @ terms.residuals.jacobians_by_camera(state.cTl, state.time_offsets_s[0])
-    prior = hessian - np.einsum("nki,nkj->ij", J, J)
-    bread, information = _informed(hessian, prior, (J, by_camera), _noise_of_twists(terms))
+    bread = _inverse_without(hessian, NOISE_INFORMATION_MARGIN * _noise_information(terms))
     scores = (np.swapaxes(J, 1, 2) @ r[..., None])[..., 0]
     # The rows of a direction that is not used are 0 in J.
-    moved = np.swapaxes(J, 1, 2) @ terms.roots
+    moved = np.swapaxes(J, 1, 2) @ np.linalg.inv(np.linalg.cholesky(terms.covariances))
     seconds = 1e-9 * np.array([camera.to_ns - camera.from_ns for camera in cameras])
     shared = np.zeros((7, 6))
     shared[:, :3] = np.radians(errors.turn_rate_deg_s) * np.tensordot(seconds, moved[:, :, :3], 1)
     shared[:, 3:] = np.radians(errors.direction_deg) * moved[:, :, 3:].sum(axis=0)
     residuals = int(np.where(directed, 5, 3).sum())
-    # The scores vary with all that the LiDAR measured; the bread holds what the camera saw, too.
-    excess = _excess(scores, information - prior, _breaks(cameras), residuals)
+    excess = _excess(scores, np.einsum("nki,nkj->ij", J, J), _breaks(cameras), residuals)
     covariance = _sandwich(bread, excess) + bread @ shared @ shared.T @ bread
     return _capped(covariance)
 
@@ -102,48 +95,30 @@ def _capped(covariance: FloatArray) -> FloatArray:
     return np.asarray((vectors * np.minimum(values, 1.0)) @ vectors.T * both)
 
 
-def _noise_of_twists(terms: HandEyeTerms) -> float:
-    """Information on the offset that the noise of the LiDAR's twists, by which it moves its motions, seems to
-    bring."""
-    H = terms.rows_H_step
-    back = np.swapaxes(H, 1, 2) @ np.linalg.inv(terms.covariances) @ H
-    return float(np.einsum("nij,nji->", back, terms.pairs.lidars.twist_covariances))
+def _noise_information(terms: HandEyeTerms) -> FloatArray:
+    """(7, 7) information that the noise of the LiDAR's motions seems to bring, as if they were turns."""
+    lidars, H = terms.pairs.lidars, terms.rows_H_step
+    weights = np.linalg.inv(terms.covariances)
+    back = np.swapaxes(H, 1, 2) @ weights @ H
+    result = np.zeros((7, 7))
+    result[6, 6] = np.einsum("nij,nji->", back, lidars.twist_covariances)
+    variances, axes = np.linalg.eigh(lidars.covariances)
+    # ad(axis) is linear in the axis.
+    generators = np.array([gtsam.Pose3.adjointMap(unit) for unit in np.eye(6)])
+    for variance, axis in zip(np.maximum(variances, 0.0).T, axes.transpose(2, 0, 1), strict=True):
+        ad = np.tensordot(axis, generators, 1)
+        result[:6, :6] += np.einsum("n,nki,nkl,nlj->ij", variance, ad, back, ad, optimize=True)
+    return result
 
 
-def _informed(
-    hessian: FloatArray, prior: FloatArray, jacobians: tuple[FloatArray, FloatArray], of_twists: float
-) -> tuple[FloatArray, FloatArray]:
-    """(7, 7) covariance and information of what both sensors saw, in every direction between next to nothing
-    and the hessian's.
-
-    J' J counts what the LiDAR measured, noise and all, twice: noise looks like turns. Where the camera's
-    motions stand in one of the two places only what both saw remains, however large the noise is: the
-    camera's motions are the instrument (Söderström, Errors-in-variables methods in system identification,
-    Automatica 2007, sec. 4). The estimate is where that is largest, also where both saw noise alone: then it
-    is the length of two random components, and what one in twenty exceeds is taken off.
-
-    Args:
-        prior: (7, 7) information of the priors, a part of the hessian.
-        jacobians: (n, 6, 7) whitened, of the LiDAR's motions and with the camera's in their place.
-        of_twists: information by the noise of the twists, which no camera measures.
-    """
+def _inverse_without(hessian: FloatArray, noise: FloatArray) -> FloatArray:
+    """(7, 7) inverse of the information less that by noise, kept positive definite."""
     scale = unit_scale(hessian)
-    whitener = np.linalg.inv(np.linalg.cholesky(with_ridge(hessian * np.outer(scale, scale)))) * scale
-    lidar, camera = (each @ whitener.T for each in jacobians)
-    common = np.einsum("nki,nkj->ij", lidar, camera)
-    known = whitener @ prior @ whitener.T + 0.5 * (common + common.T)
-    known -= TWIST_NOISE_MARGIN * of_twists * np.outer(whitener[:, 6], whitener[:, 6])
-    values, vectors = np.linalg.eigh(known)
-    lidar, camera = lidar @ vectors, camera @ vectors
-    # The variance of a sum of products of a signal s and two noises, (s + n) (s + m), by n - m.
-    shares, noise = np.einsum("nki,nki->ni", lidar, camera), ((lidar - camera) ** 2).sum(axis=1)
-    variance = (np.maximum(shares, 0.0) * noise / _AXES + noise**2 / (4.0 * _AXES)).sum(axis=0)
-    total = shares.sum(axis=0)
-    surely = np.sqrt(np.maximum(total**2 - BY_CHANCE_CHI2 * variance, 0.0))
-    values = np.clip(values - np.maximum(total - surely, 0.0), LEAST_INFORMATION, 1.0)
+    both = np.outer(scale, scale)
+    whitener = np.linalg.inv(np.linalg.cholesky(with_ridge(hessian * both)))
+    values, vectors = np.linalg.eigh(np.eye(7) - whitener @ (noise * both) @ whitener.T)
     root = whitener.T @ vectors
-    back = np.linalg.inv(root)
-    return (root / values) @ root.T, (back.T * values) @ back
+    return np.asarray((root / np.maximum(values, LEAST_INFORMATION)) @ root.T * both)
 
 
 def _breaks(cameras: Sequence[CameraStep]) -> NDArray[np.bool_]:

@@ -270,7 +270,7 @@ def _terms(pairs: MotionPairs, state: State) -> HandEyeTerms:
     across[:, 3:, 3:] = lengths[:, None, None] * np.array([camera.across for camera in cameras])
     motion_covariances = np.array([camera.motion.covariance for camera in cameras])
     Ad = np.asarray(state.cTl.AdjointMap())
-    covariances = Ad @ (lidars.covariances + lidars.interpolation_covariances) @ Ad.T
+    covariances = Ad @ lidars.covariances @ Ad.T
     covariances += across @ motion_covariances @ np.swapaxes(across, 1, 2)
     # 2. The same of rotation and unit direction. Along the direction, where the difference of two unit
     # vectors is of second order, the mean of the two across keeps it regular.

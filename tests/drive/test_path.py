@@ -143,37 +143,3 @@ def test_rate_of_the_covariance_is_its_derivative() -> None:
         slope = (after.covariances - before.covariances) / (2e-9 * h)
         np.testing.assert_allclose(slope, here.covariance_rates, atol=1e-9)
     assert after.covariances[0, 0, 0] < COVARIANCE[0, 0]
-
-
-def rocking(t: float) -> gtsam.Pose3:
-    """Pose at a time [s]: stops at 1.5 s and rocks back, 0.5 deg within 0.3 s."""
-    angle = np.radians(0.5) * np.exp(-6.0 * max(t - 1.5, 0.0)) * np.sin(10.0 * max(t - 1.5, 0.0))
-    return gtsam.Pose3(gtsam.Rot3.Ry(angle), np.array([8.0 * min(t, 1.5), 0.0, 0.0]))
-
-
-def test_what_is_between_stamps_is_in_the_covariance() -> None:
-    """Errors where a vehicle rocks as it stops, at all phases of the stamps, over what is said of them."""
-    errors, sigmas = [], []
-    for phase_ns in range(0, PERIOD_NS, PERIOD_NS // 10):
-        path = SensorPath(motions(lambda t, phase=phase_ns: rocking(t + 1e-9 * phase), evenly(40)))
-        starts = np.arange(2, 36) * PERIOD_NS + PERIOD_NS // 2
-        steps = path.steps(starts, starts + PERIOD_NS)
-        for a, aTb in zip(starts, steps.aTbs, strict=True):
-            ends = [rocking(1e-9 * (t + phase_ns)) for t in (a, a + PERIOD_NS)]
-            turn = gtsam.Pose3(aTb).rotation().between(ends[0].between(ends[1]).rotation())
-            errors.append(gtsam.Rot3.Logmap(turn)[1])
-        sigmas += np.sqrt(steps.interpolation_covariances[:, 1, 1]).tolist()
-    assert np.abs(errors).max() > np.radians(0.05)
-    assert 0.5 < np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(sigmas))) < 2.0
-
-
-def test_noise_is_hardly_taken_for_what_is_between_stamps() -> None:
-    rng, sigma, shares = np.random.default_rng(7), np.sqrt(0.5 * COVARIANCE[0, 0]), []
-    for fraction in (0, PERIOD_NS // 2):
-        turns = rng.standard_normal((200, 3))
-        poses = [gtsam.Pose3(gtsam.Rot3.Expmap(sigma * turn), np.zeros(3)) for turn in turns]
-        path = SensorPath(motions(lambda t, poses=poses: poses[round(10 * t)], evenly(200)))
-        starts = np.arange(5, 190) * PERIOD_NS + fraction
-        steps = path.steps(starts, starts + PERIOD_NS)
-        shares.append(steps.interpolation_covariances[:, 0, 0].mean() / steps.covariances[0, 0, 0])
-    assert shares[0] < 1e-9 and shares[1] < 0.15
