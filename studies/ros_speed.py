@@ -3,10 +3,11 @@
     make ros-check                                                     an environment with ROS 2
     OMP_NUM_THREADS=1 PYTHONPATH=. build/ros-kilted/bin/python studies/ros_speed.py DRIVE
 
-The delay of a line is the time from the publication of the later message of its pair to the line's arrival
-here; ``hold_s``, for which the node waits for messages out of order, is a part of it. What is published (the
-player) and the node share the machine. The last column is the node's processor time for a pair, its start and
-its end left out. Played back, an image that is stamped too late is too early: a drive without a time offset.
+The delay of a line is the time from the publication of its cloud to its arrival here; ``hold_s``, for which
+the node waits for messages out of order, is a part of it. What is published (the player) and the node share
+the machine. The last column is the node's processor time for a pair, from its first message to the last; the
+tracker's start is in it. Played back, an image that is stamped too late is too early: a drive without a time
+offset.
 """
 
 from __future__ import annotations

@@ -132,8 +132,9 @@ def find_boundaries(
         return {}
     # Upside down, what the scan lines leave at the top is the ground: they are turned by half a turn.
     up = up_direction(points)
-    turn = _HALF_TURN if up[2] < 0.0 else np.ones(3)
-    points, up = points * turn, up * turn
+    upside_down = bool(up[2] < 0.0)
+    if upside_down:
+        points, up = points * _HALF_TURN, up * _HALF_TURN
     beams = arrange_beams(points, None if scan.rings is None else scan.rings[usable])
     offsets = np.zeros(len(points)) if scan.offsets_s is None else scan.offsets_s[usable].astype(float)
     instances = None if scan.instances is None else scan.instances[usable]
@@ -152,7 +153,9 @@ def find_boundaries(
         if with_lower_edges and c != SemanticClass.OBJECT:
             parts.append(_ring_edges(points, seen, beams, _ground_below(points @ up, objects)))
         edges = _collect(parts, beams.ring, offsets, objects, max_range_m)
-        found[c] = replace(edges, lPs=edges.lPs * turn, outward=edges.outward * turn)
+        if upside_down:
+            edges = replace(edges, lPs=edges.lPs * _HALF_TURN, outward=edges.outward * _HALF_TURN)
+        found[c] = edges
     return {c: b for c, b in found.items() if len(b)}
 
 
