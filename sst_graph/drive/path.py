@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -15,6 +16,14 @@ _REACH = 2
 """Poses to either side of one that determine the twist there."""
 _NODES = 2 * _REACH + 2
 """Most poses that a polynomial of an interval follows from."""
+_JUDGES = 8
+"""Poses that tell the error between stamps, from two polynomials of one pose less."""
+_ERROR = 1.5
+"""Error between stamps over the distance of those two: 1.0 for a sine of 2.5 Hz at 10 Hz, 1.5 for one of
+1.5 Hz, 1.3 to 1.6 where a vehicle brakes and rocks at these rates, 1.5 where rates of turn jump, 2.2 where
+accelerations are white."""
+_MEDIAN_CHI2 = 0.455
+"""Median of the chi-squared distribution of one degree of freedom."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +34,8 @@ class PathSteps:
         found: (m,) which of the intervals that were asked for these are: the path does not reach the others.
         aTbs: (m, 4, 4) poses of the sensor at the end in its frame at the beginning.
         twists_a, twists_b: (m, 6) its twist at both ends, in its own frame [rad/s, m/s].
-        covariances: (m, 6, 6) of aTb, [rot rad, trans m], right perturbation.
+        covariances: (m, 6, 6) of aTb, [rot rad, trans m], right perturbation: by the noise of the poses and
+            by what is between the stamps and not known.
         covariance_rates: (m, 6, 6) its change as both ends move on in time [1/s]: between two stamps the
             noise of their poses is averaged, at a stamp it is not.
         twist_covariances: (m, 6, 6) of the rate at which aTb changes as both ends move on.
@@ -56,6 +66,10 @@ class SensorPath:
     Overhauser, who blends parabolas), so that twists are continuous, too. Parabolas would be 15 % short of
     the rate of a pitching at 1.5 Hz that is seen at 10 Hz; these are 3 % short. None is known across a motion
     that failed, or beyond the ends.
+
+    What a vehicle does between two stamps shows in the next poses, too: polynomials through all but the first
+    and all but the last of eight differ by as much as the interpolation errs, and by noise of the poses,
+    whose usual size is taken off.
     """
 
     def __init__(self, motions: Sequence[RelativeMotion]) -> None:
@@ -68,6 +82,7 @@ class SensorPath:
         broken = np.array([not motion.ok for motion in motions], np.int64)
         self._piece = np.concatenate([[0], np.cumsum(broken)])
         self._polynomials: dict[int, _Polynomial] = {}
+        self._differences: dict[int, _Polynomial] = {}
         self._ok = np.array([motion.ok for motion in motions], np.bool_)
         self._covariances = np.array([motion.covariance for motion in motions]).reshape(-1, 6, 6)
         self._matrices = np.array([pose.matrix() for pose in self._poses])
@@ -90,7 +105,9 @@ class SensorPath:
         # Each time once: mostly, one step ends where the next begins.
         times, place = np.unique(np.concatenate([from_ns[found], to_ns[found]]), return_inverse=True)
         place = place.reshape(2, n)
-        poses, twists, weights = self._interpolated(self._intervals(times), times)
+        intervals = self._intervals(times)
+        poses, twists, weights = self._interpolated(intervals, times)
+        between = self._squared_errors(intervals, times)[place].sum(axis=0)
         # Every pose errs by itself: what the step takes from each of them, and how that changes.
         oldest = np.maximum(np.array([first, last]) - _REACH, 0)
         ahead = oldest[1] - oldest[0]
@@ -110,7 +127,7 @@ class SensorPath:
             aTbs,
             twists[place[0]],
             twists[place[1]],
-            of_pose * products[:, 0, 0, None, None],
+            of_pose * products[:, 0, 0, None, None] + between[:, :, None] * np.eye(6),
             of_pose * (2.0 * products[:, 0, 1, None, None]),
             of_pose * products[:, 1, 1, None, None],
         )
@@ -144,6 +161,61 @@ class SensorPath:
         derivatives = np.array([gtsam.Pose3.ExpmapDerivative(log) for log in logs])
         return starts @ moved, (derivatives @ slopes[..., None])[..., 0], np.swapaxes(weights, 1, 2)
 
+    def _squared_errors(self, intervals: IntArray, stamps_ns: NDArray[np.int64]) -> FloatArray:
+        """(n, 6) expected squares of the errors between stamps, at times (n,) in intervals (n,)."""
+        squares, by_noise = self._distances(intervals, stamps_ns)
+        return np.asarray(_ERROR**2 * np.maximum(squares - by_noise[:, None] * self._pose_noise, 0.0))
+
+    @cached_property
+    def _pose_noise(self) -> FloatArray:
+        """(6,) variances of the poses that would make the median distance in the middle of intervals."""
+        intervals = np.flatnonzero(self._ok)
+        middles = self._stamps[intervals] + np.diff(self._stamps)[intervals] // 2
+        squares, by_noise = self._distances(intervals, middles)
+        told = by_noise > 0.0
+        ratios = squares[told] / by_noise[told, None]
+        return np.asarray(np.median(ratios, axis=0) / _MEDIAN_CHI2 if len(ratios) else np.zeros(6))
+
+    def _distances(self, intervals: IntArray, stamps_ns: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
+        """(n, 6) squared distances of the two polynomials that tell the error, and (n,) their variance by a
+        unit one of the poses, at times (n,) in intervals (n,).
+
+        At an end of the path they are those of the nearest interval that has four poses to either side; 0
+        where none has.
+        """
+        if not len(intervals):
+            return np.zeros((0, 6)), np.zeros(0)
+        differences = [self._difference(i) for i in intervals.tolist()]
+        seconds = 1e-9 * (stamps_ns - self._stamps[intervals])
+        powers = (seconds[:, None] ** np.arange(_JUDGES - 1))[:, None]
+        apart = (powers @ np.array([each.coefficients for each in differences]))[:, 0]
+        weights = (powers @ np.array([each.inverse for each in differences]))[:, 0]
+        return apart**2, (weights**2).sum(axis=1)
+
+    def _difference(self, i: int) -> _Polynomial:
+        """The difference of the two polynomials that tell the error in interval i."""
+        if i not in self._differences:
+            begin, end = self._ends(i)
+            half = _JUDGES // 2
+            inverse, coefficients = np.zeros((_JUDGES - 1, _JUDGES)), np.zeros((_JUDGES - 1, 6))
+            if end - begin >= _JUDGES:
+                nearest = min(max(i, begin + half - 1), end - half - 1)
+                times, logs = self._around(nearest, slice(nearest + 1 - half, nearest + 1 + half))
+                inverse = _difference(times)
+                coefficients = inverse @ logs
+            self._differences[i] = _Polynomial(inverse, coefficients)
+        return self._differences[i]
+
+    def _ends(self, i: int) -> tuple[int, int]:
+        """The first pose of the piece of interval i, and the one after its last."""
+        begin, end = np.searchsorted(self._piece, self._piece[i + 1] + np.arange(2)).tolist()
+        return begin, end
+
+    def _around(self, i: int, poses: slice) -> tuple[FloatArray, FloatArray]:
+        """(m,) times after pose i [s], and (m, 6) logarithms in its frame, of the poses of a slice."""
+        logs = [gtsam.Pose3.Logmap(self._poses[i].between(pose)) for pose in self._poses[poses]]
+        return 1e-9 * (self._stamps[poses] - self._stamps[i]), np.stack(logs)
+
     def _mean_covariances(self, first: IntArray, last: IntArray) -> FloatArray:
         """(n, 6, 6) mean over the motions from the first to the last of each step."""
         total, longest = np.zeros((len(first), 6, 6)), int((last - first).max(initial=0))
@@ -155,34 +227,40 @@ class SensorPath:
     def _polynomial(self, i: int) -> _Polynomial:
         """The polynomial of interval i."""
         if i not in self._polynomials:
-            around = [
-                k
-                for k in range(max(i - _REACH, 0), min(i + 2 + _REACH, len(self._poses)))
-                if self._piece[k] == self._piece[i + 1]
-            ]
-            times = (self._stamps[around] - self._stamps[i]) * 1e-9
-            logs = [gtsam.Pose3.Logmap(self._poses[i].between(self._poses[k])) for k in around]
-            blended = _blended(times, around.index(i))
+            begin, end = self._ends(i)
+            around = slice(max(i - _REACH, begin), min(i + 2 + _REACH, end))
+            times, logs = self._around(i, around)
+            blended = _blended(times, i - around.start)
             coefficients, inverse = np.zeros((_NODES, 6)), np.zeros((_NODES, _NODES))
-            coefficients[: len(blended)] = blended @ np.stack(logs)
-            oldest = around[0] - max(i - _REACH, 0)
-            inverse[: len(blended), oldest : oldest + len(around)] = blended
+            coefficients[: len(blended)] = blended @ logs
+            oldest = around.start - max(i - _REACH, 0)
+            inverse[: len(blended), oldest : oldest + len(times)] = blended
             self._polynomials[i] = _Polynomial(inverse, coefficients)
         return self._polynomials[i]
 
 
 @dataclass(frozen=True)
 class _Polynomial:
-    """Polynomial of one interval.
+    """Polynomial of one interval, or the difference of two.
 
     Attributes:
-        inverse: (_NODES, _NODES) from values at the poses from the oldest one around the interval on to
-            coefficients by power of the seconds; 0 for poses that it does not follow from.
-        coefficients: (_NODES, 6) of the logarithm in the frame of the interval's first pose.
+        inverse: (k, m) from values at m poses, the oldest first, to k coefficients by power of the seconds; 0
+            for poses that it does not follow from.
+        coefficients: (k, 6) of the logarithm in the frame of the interval's first pose.
     """
 
     inverse: FloatArray
     coefficients: FloatArray
+
+
+def _difference(times: FloatArray) -> FloatArray:
+    """(m - 1, m) from values at times (m,) to coefficients by power: the polynomial through all but the last
+    less that through all but the first."""
+    m = len(times)
+    result = np.zeros((m - 1, m))
+    result[:, :-1] += np.linalg.inv(np.vander(times[:-1], increasing=True))
+    result[:, 1:] -= np.linalg.inv(np.vander(times[1:], increasing=True))
+    return result
 
 
 def _blended(times: FloatArray, first: int) -> FloatArray:

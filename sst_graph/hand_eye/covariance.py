@@ -5,7 +5,7 @@ A scan and an image end one pair and begin the next, so scores of neighbours are
 summed with falling weights (Bartlett's kernel: Newey & West, Econometrica 1987), with the usual correction
 for few pairs (Cameron & Miller, A practitioner's guide to cluster-robust inference, 2015, sec. VI.B).
 An error that all pairs share, such as that of the principal point, does not show in the residuals: it is
-given by :class:`MotionErrors`.
+given by :class:`MotionErrors`. Of the rotation, no more counts as known than both sensors saw.
 """
 
 from __future__ import annotations
@@ -25,11 +25,15 @@ from sst_graph.types import FloatArray
 
 NOISE_INFORMATION_MARGIN = 2.0
 """Factor on the spurious information by noise, whose size is estimated from the same few motions."""
+BY_CHANCE_CHI2 = 5.99
+"""95 % quantile of chi-squared with 2 degrees of freedom."""
 MOST_TAKEN_OFF = 0.5
 """Largest fraction of the variance that may be subtracted for neighbouring scores that cancel: a few cancel
 by chance."""
 LEAST_INFORMATION = 1e-3
 """In any direction at least this part of the information remains, to keep it positive."""
+_AXES = 2
+"""Rotation about an axis turns vectors across it, which have two components."""
 _LAGS = 3
 """Neighbours up to this far apart may be correlated: a scan and an image end one pair and begin the next, and
 smoothing spreads errors a little farther. More lags make the estimate noisier."""
@@ -64,12 +68,15 @@ def hand_eye_covariance(
         hessian: (7, 7) information there of the whole graph, the priors among it.
         errors: the errors that all pairs share.
     """
+    # 1. The information, less what noise seems to bring.
     J, r = terms.linearized(state)
     cameras, directed = terms.pairs.cameras, terms.residuals.directed
-    bread = _inverse_without(hessian, NOISE_INFORMATION_MARGIN * _noise_information(terms))
+    by_noise = NOISE_INFORMATION_MARGIN * _noise_information(terms)
+    bread = _inverse_without(hessian, by_noise)
+    # 2. Scores that correlate, and errors that all pairs share.
     scores = (np.swapaxes(J, 1, 2) @ r[..., None])[..., 0]
     # The rows of a direction that is not used are 0 in J.
-    moved = np.swapaxes(J, 1, 2) @ np.linalg.inv(np.linalg.cholesky(terms.covariances))
+    moved = np.swapaxes(J, 1, 2) @ terms.roots
     seconds = 1e-9 * np.array([camera.to_ns - camera.from_ns for camera in cameras])
     shared = np.zeros((7, 6))
     shared[:, :3] = np.radians(errors.turn_rate_deg_s) * np.tensordot(seconds, moved[:, :, :3], 1)
@@ -77,7 +84,20 @@ def hand_eye_covariance(
     residuals = int(np.where(directed, 5, 3).sum())
     excess = _excess(scores, np.einsum("nki,nkj->ij", J, J), _breaks(cameras), residuals)
     covariance = _sandwich(bread, excess) + bread @ shared @ shared.T @ bread
+    # 3. The rotation is known no better than by what both sensors saw. The offset is: twists are measured by
+    # the LiDAR alone, and their noise is in step 1.
+    by_camera = terms.roots @ terms.residuals.jacobians_by_camera(state.cTl, state.time_offsets_s[0])
+    prior = hessian - np.einsum("nki,nkj->ij", J, J)
+    prior[6, 6] -= by_noise[6, 6]
+    both = _seen_by_both(hessian, prior, J, by_camera)
+    covariance[:3, :3] += _positive_part((both - bread)[:3, :3])
     return _capped(covariance)
+
+
+def _positive_part(matrix: FloatArray) -> FloatArray:
+    """(n, n) the part of a symmetric matrix with eigenvalues above 0."""
+    values, vectors = np.linalg.eigh(matrix)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
 def _sandwich(bread: FloatArray, excess: FloatArray) -> FloatArray:
@@ -119,6 +139,39 @@ def _inverse_without(hessian: FloatArray, noise: FloatArray) -> FloatArray:
     values, vectors = np.linalg.eigh(np.eye(7) - whitener @ (noise * both) @ whitener.T)
     root = whitener.T @ vectors
     return np.asarray((root / np.maximum(values, LEAST_INFORMATION)) @ root.T * both)
+
+
+def _seen_by_both(
+    hessian: FloatArray, prior: FloatArray, by_lidar: FloatArray, by_camera: FloatArray
+) -> FloatArray:
+    """(7, 7) covariance by the information in what both sensors saw, in every direction between next to none
+    and the hessian.
+
+    J' J counts what the LiDAR measured, noise and all, twice: noise looks like turns. Where the camera's
+    motions stand in one of the two places only what both saw remains, however large the noise is: the
+    camera's motions are the instrument (Söderström, Errors-in-variables methods in system identification,
+    Automatica 2007, sec. 4). The estimate is where that is largest, also where both saw noise alone: then it
+    is the length of two random components, and what one in twenty exceeds is taken off.
+
+    Args:
+        prior: (7, 7) the part of the hessian that is not of the motions.
+        by_lidar, by_camera: (n, 6, 7) whitened Jacobians, of the LiDAR's motions and with the camera's in
+            their place.
+    """
+    scale = unit_scale(hessian)
+    whitener = np.linalg.inv(np.linalg.cholesky(with_ridge(hessian * np.outer(scale, scale)))) * scale
+    lidar, camera = by_lidar @ whitener.T, by_camera @ whitener.T
+    common = np.einsum("nki,nkj->ij", lidar, camera)
+    values, vectors = np.linalg.eigh(whitener @ prior @ whitener.T + 0.5 * (common + common.T))
+    lidar, camera = lidar @ vectors, camera @ vectors
+    # The variance of a sum of products of a signal s and two noises, (s + n) (s + m), by n - m.
+    shares, noise = np.einsum("nki,nki->ni", lidar, camera), ((lidar - camera) ** 2).sum(axis=1)
+    variance = (np.maximum(shares, 0.0) * noise / _AXES + noise**2 / (4.0 * _AXES)).sum(axis=0)
+    total = shares.sum(axis=0)
+    surely = np.sqrt(np.maximum(total**2 - BY_CHANCE_CHI2 * variance, 0.0))
+    values = np.clip(values - np.maximum(total - surely, 0.0), LEAST_INFORMATION, 1.0)
+    root = whitener.T @ vectors
+    return np.asarray((root / values) @ root.T)
 
 
 def _breaks(cameras: Sequence[CameraStep]) -> NDArray[np.bool_]:

@@ -26,7 +26,9 @@ def _covariance(noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     cameras: Any = tuple(SimpleNamespace(drive=0, from_ns=k, to_ns=k + 1) for k in range(PAIRS))
     lidars: Any = SimpleNamespace(covariances=still, twist_covariances=still)
     residuals: Any = SimpleNamespace(
-        directed=np.ones(PAIRS, bool), evaluate=lambda cTl, time_offset_s, jacobians: (noise, blocks)
+        directed=np.ones(PAIRS, bool),
+        evaluate=lambda cTl, time_offset_s, jacobians: (noise, blocks),
+        jacobians_by_camera=lambda cTl, time_offset_s: blocks,
     )
     units = np.tile(np.eye(6), (PAIRS, 1, 1))
     terms = HandEyeTerms(MotionPairs(cameras, lidars), residuals, units, np.zeros(PAIRS), still)

@@ -143,3 +143,45 @@ def test_rate_of_the_covariance_is_its_derivative() -> None:
         slope = (after.covariances - before.covariances) / (2e-9 * h)
         np.testing.assert_allclose(slope, here.covariance_rates, atol=1e-9)
     assert after.covariances[0, 0, 0] < COVARIANCE[0, 0]
+
+
+def rocking(t: float) -> gtsam.Pose3:
+    """Pose at a time [s]: stops at 1.5 s and rocks back, 0.5 deg within 0.3 s."""
+    angle = np.radians(0.5) * np.exp(-6.0 * max(t - 1.5, 0.0)) * np.sin(10.0 * max(t - 1.5, 0.0))
+    return gtsam.Pose3(gtsam.Rot3.Ry(angle), np.array([8.0 * min(t, 1.5), 0.0, 0.0]))
+
+
+def test_what_is_between_stamps_is_in_the_covariance() -> None:
+    """Errors in the middle between stamps, at all phases of the stamps, over what is said of them."""
+    starts = np.arange(4, 34) * PERIOD_NS + PERIOD_NS // 2
+    by_noise = SensorPath(motions(weaving, evenly(40))).steps(starts, starts + PERIOD_NS).covariances[:, 1, 1]
+    errors, variances = [], []
+    for phase_ns in range(0, PERIOD_NS, PERIOD_NS // 10):
+        path = SensorPath(motions(lambda t, phase=phase_ns: rocking(t + 1e-9 * phase), evenly(40)))
+        steps = path.steps(starts, starts + PERIOD_NS)
+        for a, aTb in zip(starts, steps.aTbs, strict=True):
+            ends = [rocking(1e-9 * (t + phase_ns)) for t in (a, a + PERIOD_NS)]
+            turn = gtsam.Pose3(aTb).rotation().between(ends[0].between(ends[1]).rotation())
+            errors.append(gtsam.Rot3.Logmap(turn)[1])
+        variances += (steps.covariances[:, 1, 1] - by_noise).tolist()
+    assert np.abs(errors).max() > np.radians(0.05)
+    assert 0.5 < np.sqrt(np.mean(np.square(errors)) / np.mean(variances)) < 2.0
+
+
+def test_noise_is_hardly_taken_for_what_is_between_stamps() -> None:
+    rng, sigma = np.random.default_rng(7), np.sqrt(0.5 * COVARIANCE[0, 0])
+    turns = rng.standard_normal((200, 3))
+    noisy = [gtsam.Pose3(gtsam.Rot3.Expmap(sigma * turn), np.zeros(3)) for turn in turns]
+    found = []
+    for poses in (noisy, [gtsam.Pose3()] * 200):
+        path = SensorPath(motions(lambda t, poses=poses: poses[round(10 * t)], evenly(200)))
+        starts = np.arange(5, 190) * PERIOD_NS + PERIOD_NS // 2
+        found.append(path.steps(starts, starts + PERIOD_NS).covariances[:, 0, 0].mean())
+    assert 1.0 <= found[0] / found[1] < 1.25
+
+
+def test_at_stamps_nothing_is_between() -> None:
+    starts = np.arange(40) * PERIOD_NS
+    still = SensorPath(motions(weaving, evenly(42))).steps(starts, starts + PERIOD_NS)
+    rocks = SensorPath(motions(rocking, evenly(42))).steps(starts, starts + PERIOD_NS)
+    np.testing.assert_allclose(rocks.covariances, still.covariances, rtol=1e-9)

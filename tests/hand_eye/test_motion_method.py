@@ -96,6 +96,15 @@ def test_noise_is_no_turning() -> None:
     assert min(np.sqrt(s.covariance[6, 6]) for s in found) > 0.03
 
 
+def test_noise_that_the_odometry_does_not_know_of_tells_no_roll() -> None:
+    """On a straight road a LiDAR that sees itself swerve, and the camera does not, tells no roll."""
+    shares = []
+    for seed in range(8):
+        solution = solve_motion([made_drive(straight, seed=seed, yaw_noise=5.0)], Guess(TRUE, OFFSET_S))[0]
+        shares.append(error_of(solution)[0] / np.sqrt(solution.covariance[0, 0]))
+    assert np.sqrt(np.mean(np.square(shares))) < 2.5 and np.abs(shares).max() < 3.5
+
+
 def test_standing_tells_nothing() -> None:
     result = calibrate_prepared([made_drive(resting)], off(3.0), _config())
     assert result.status == "unobservable"

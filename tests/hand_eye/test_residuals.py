@@ -64,3 +64,13 @@ def test_a_motion_without_direction_has_rows_of_zeros() -> None:
     J, r = terms.linearized(State(TRUE, (OFFSET_S,)))
     assert not J[:, 3:].any() and not r[:, 3:].any() and r[:, :3].any()
     assert isinstance(terms.factor(), gtsam.CustomFactor)
+
+
+def test_jacobians_by_the_cameras_motions_are_those_of_the_lidars_but_for_noise() -> None:
+    drive = made_drive(weaving, frames=12, noise=1e-4)
+    pairs = pair_motions(camera_steps([drive]), lidar_paths([drive]), OFFSET_S)
+    residuals = hand_eye_terms(pairs, State(TRUE, (OFFSET_S,)))[0].residuals
+    H, by_camera = residuals.evaluate(TRUE, OFFSET_S, True)[1], residuals.jacobians_by_camera(TRUE, OFFSET_S)
+    assert np.abs(by_camera).max() > 0.1
+    # What is left is the interpolation between stamps.
+    np.testing.assert_allclose(by_camera, H, atol=0.02 * np.abs(H).max())
