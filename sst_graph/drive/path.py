@@ -201,7 +201,7 @@ class SensorPath:
             if end - begin >= _JUDGES:
                 nearest = min(max(i, begin + half - 1), end - half - 1)
                 times, logs = self._around(nearest, slice(nearest + 1 - half, nearest + 1 + half))
-                inverse = _difference(times)
+                inverse = _difference_of_two(times)
                 coefficients = inverse @ logs
             self._differences[i] = _Polynomial(inverse, coefficients)
         return self._differences[i]
@@ -253,7 +253,7 @@ class _Polynomial:
     coefficients: FloatArray
 
 
-def _difference(times: FloatArray) -> FloatArray:
+def _difference_of_two(times: FloatArray) -> FloatArray:
     """(m - 1, m) from values at times (m,) to coefficients by power: the polynomial through all but the last
     less that through all but the first."""
     m = len(times)
