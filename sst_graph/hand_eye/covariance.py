@@ -72,7 +72,8 @@ def hand_eye_covariance(
     J, r = terms.linearized(state)
     cameras, directed = terms.pairs.cameras, terms.residuals.directed
     by_noise = NOISE_INFORMATION_MARGIN * _noise_information(terms)
-    bread = _inverse_without(hessian, by_noise)
+    whitener, model = _whitener(hessian), np.einsum("nki,nkj->ij", J, J)
+    bread = _inverse_without(whitener, by_noise)
     # 2. Scores that correlate, and errors that all pairs share.
     scores = (np.swapaxes(J, 1, 2) @ r[..., None])[..., 0]
     # The rows of a direction that is not used are 0 in J.
@@ -82,14 +83,14 @@ def hand_eye_covariance(
     shared[:, :3] = np.radians(errors.turn_rate_deg_s) * np.tensordot(seconds, moved[:, :, :3], 1)
     shared[:, 3:] = np.radians(errors.direction_deg) * moved[:, :, 3:].sum(axis=0)
     residuals = int(np.where(directed, 5, 3).sum())
-    excess = _excess(scores, np.einsum("nki,nkj->ij", J, J), _breaks(cameras), residuals)
+    excess = _excess(scores, model, _breaks(cameras), residuals)
     covariance = _sandwich(bread, excess) + bread @ shared @ shared.T @ bread
     # 3. The rotation is known no better than by what both sensors saw. The offset is: twists are measured by
     # the LiDAR alone, and their noise is in step 1.
     by_camera = terms.roots @ terms.residuals.jacobians_by_camera(state.cTl, state.time_offsets_s[0])
-    prior = hessian - np.einsum("nki,nkj->ij", J, J)
+    prior = hessian - model
     prior[6, 6] -= by_noise[6, 6]
-    both = _seen_by_both(hessian, prior, J, by_camera)
+    both = _seen_by_both(whitener, prior, J, by_camera)
     covariance[:3, :3] += _positive_part((both - bread)[:3, :3])
     return _capped(covariance)
 
@@ -131,18 +132,21 @@ def _noise_information(terms: HandEyeTerms) -> FloatArray:
     return result
 
 
-def _inverse_without(hessian: FloatArray, noise: FloatArray) -> FloatArray:
-    """(7, 7) inverse of the information less that by noise, kept positive definite."""
+def _whitener(hessian: FloatArray) -> FloatArray:
+    """(7, 7) W with W hessian W' = 1."""
     scale = unit_scale(hessian)
-    both = np.outer(scale, scale)
-    whitener = np.linalg.inv(np.linalg.cholesky(with_ridge(hessian * both)))
-    values, vectors = np.linalg.eigh(np.eye(7) - whitener @ (noise * both) @ whitener.T)
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(with_ridge(hessian * np.outer(scale, scale)))) * scale)
+
+
+def _inverse_without(whitener: FloatArray, noise: FloatArray) -> FloatArray:
+    """(7, 7) inverse of the information less that by noise, kept positive definite."""
+    values, vectors = np.linalg.eigh(np.eye(7) - whitener @ noise @ whitener.T)
     root = whitener.T @ vectors
-    return np.asarray((root / np.maximum(values, LEAST_INFORMATION)) @ root.T * both)
+    return np.asarray((root / np.maximum(values, LEAST_INFORMATION)) @ root.T)
 
 
 def _seen_by_both(
-    hessian: FloatArray, prior: FloatArray, by_lidar: FloatArray, by_camera: FloatArray
+    whitener: FloatArray, prior: FloatArray, by_lidar: FloatArray, by_camera: FloatArray
 ) -> FloatArray:
     """(7, 7) covariance by the information in what both sensors saw, in every direction between next to none
     and the hessian.
@@ -154,12 +158,11 @@ def _seen_by_both(
     is the length of two random components, and what one in twenty exceeds is taken off.
 
     Args:
+        whitener: (7, 7) of the hessian.
         prior: (7, 7) the part of the hessian that is not of the motions.
         by_lidar, by_camera: (n, 6, 7) whitened Jacobians, of the LiDAR's motions and with the camera's in
             their place.
     """
-    scale = unit_scale(hessian)
-    whitener = np.linalg.inv(np.linalg.cholesky(with_ridge(hessian * np.outer(scale, scale)))) * scale
     lidar, camera = by_lidar @ whitener.T, by_camera @ whitener.T
     common = np.einsum("nki,nkj->ij", lidar, camera)
     values, vectors = np.linalg.eigh(whitener @ prior @ whitener.T + 0.5 * (common + common.T))

@@ -51,12 +51,12 @@ class MotionResiduals:
         cTl and the time offset; else (0, 6, 7)."""
         moved = self._moved(time_offset_s)
         predicted = np.asarray(cTl.matrix()) @ moved @ np.asarray(cTl.inverse().matrix())
-        R, t = predicted[:, :3, :3], predicted[:, :3, 3]
-        logs = self._turns(R)
+        t, turns = predicted[:, :3, 3], np.swapaxes(self.c1Rc2s, 1, 2) @ predicted[:, :3, :3]
+        logs = np.array([gtsam.Rot3.Logmap(gtsam.Rot3(turn)) for turn in turns])
         lengths = np.sqrt(np.einsum("ij,ij->i", t, t) + LOW_TRANSLATION_M**2)[:, None]
         errors = np.concatenate([logs, t / lengths - self.directions], axis=1)
         errors[~self.directed, 3:] = 0.0
-        return errors, self._jacobians(cTl, moved, logs) if jacobians else np.zeros((0, 6, 7))
+        return errors, self._jacobians(cTl, moved, predicted, logs) if jacobians else np.zeros((0, 6, 7))
 
     def jacobians_by_camera(self, cTl: gtsam.Pose3, time_offset_s: float) -> FloatArray:
         """(n, 6, 7) Jacobians where the camera's motions take the place of the LiDAR's: the same but for the
@@ -66,15 +66,13 @@ class MotionResiduals:
         predicted[:, :3, :3] = self.c1Rc2s
         predicted[self.directed, :3, 3] = (lengths * self.directions)[self.directed]
         moved = np.asarray(cTl.inverse().matrix()) @ predicted @ np.asarray(cTl.matrix())
-        return self._jacobians(cTl, moved, np.zeros((len(moved), 3)))
+        return self._jacobians(cTl, moved, predicted, np.zeros((len(moved), 3)))
 
-    def _turns(self, R: FloatArray) -> FloatArray:
-        """(n, 3) rotation vectors from the measured rotations to others (n, 3, 3)."""
-        turns = np.swapaxes(self.c1Rc2s, 1, 2) @ R
-        return np.array([gtsam.Rot3.Logmap(gtsam.Rot3(turn)) for turn in turns])
-
-    def _jacobians(self, cTl: gtsam.Pose3, moved: FloatArray, logs: FloatArray) -> FloatArray:
-        """(n, 6, 7) Jacobians at motions of the LiDAR (n, 4, 4) that leave turns (n, 3) to the measured."""
+    def _jacobians(
+        self, cTl: gtsam.Pose3, moved: FloatArray, predicted: FloatArray, logs: FloatArray
+    ) -> FloatArray:
+        """(n, 6, 7) Jacobians at motions of the LiDAR and of the camera by them (n, 4, 4), which leave turns
+        (n, 3) to the measured."""
         # 1. The predicted motion's right perturbation by those of cTl and the offset.
         back, Ad = _adjoints(_inverses(moved)), np.asarray(cTl.AdjointMap())
         predicted_H = np.empty((len(moved), 6, 7))
@@ -82,7 +80,6 @@ class MotionResiduals:
         rates = self.twists_2 - (back @ self.twists_1[..., None])[..., 0]
         predicted_H[:, :, 6] = rates @ Ad.T
         # 2. The residual by that; t of P Exp([w, v]) is t + R v.
-        predicted = np.asarray(cTl.matrix()) @ moved @ np.asarray(cTl.inverse().matrix())
         R, t = predicted[:, :3, :3], predicted[:, :3, 3]
         lengths = np.sqrt(np.einsum("ij,ij->i", t, t) + LOW_TRANSLATION_M**2)[:, None]
         H = np.empty_like(predicted_H)
