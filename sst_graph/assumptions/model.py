@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 
 from sst_graph.factors.camera import PinholeCamera
@@ -105,8 +106,9 @@ class Assumption:
         by_edges: whether edges test it, which estimate all such parameters together
             (:mod:`sst_graph.batch.by_edges.lens`).
         of_lidar: whether it is about the LiDAR: all cameras on it then have its error in common.
-        turns_motion: whether a value other than zero turns or delays the calibration by motion alone, which
-            takes it for zero: a principal point 10 px away turns a camera of 700 px by 0.8 deg.
+        motion_step: (7,) step of the calibration by motion alone by one unit of the parameter [rad, m, s], at
+            an extrinsic: motion takes the parameter for zero. None where it hardly follows it.
+        misleads_motion: whether it does follow it, by a step that is not known beforehand.
     """
 
     name: str
@@ -121,7 +123,8 @@ class Assumption:
     by_matches: bool = True
     by_edges: bool = False
     of_lidar: bool = False
-    turns_motion: bool = False
+    motion_step: Callable[[PinholeCamera, gtsam.Pose3], FloatArray] | None = None
+    misleads_motion: bool = False
 
     def contradicted_by(self, value: float, sigma: float, threshold: float) -> bool:
         """Whether an estimate with its deviation is so many deviations from zero.

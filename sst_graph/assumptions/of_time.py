@@ -27,7 +27,7 @@ SKEW = Assumption(
     span=0.05,
     violation="one clock runs faster than the other: the time offset grows",
     remedy="synchronise the clocks, or estimate the skew with --estimate skew",
-    turns_motion=True,
+    misleads_motion=True,
 )
 LINE_DELAY = Assumption(
     name="line_delay",

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import gtsam
 import numpy as np
 
 from sst_graph.batch.config import CalibrationConfig
@@ -17,8 +16,9 @@ from sst_graph.covariance.contradiction import Difference, PartEstimate, name_st
 from sst_graph.covariance.observability import weak_directions
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
+from sst_graph.graph.known import KnownCalibration, motion_steps
 from sst_graph.graph.outer_loop import KERNELS_PX, solve_joint
-from sst_graph.graph.state import EXTRINSIC, State, difference, time_offset_key
+from sst_graph.graph.state import State, difference, nuisance_key
 from sst_graph.hand_eye.solution import MotionSolution, solve_motion
 from sst_graph.types import FloatArray, Guess
 
@@ -59,7 +59,7 @@ def with_motion(
 
     With ``use_motion=auto`` the motion is used where the labels determine all unknowns by themselves and the
     points of a scan share one time: a rolling sweep is compensated by the very motion. Nor is it used where a
-    parameter is estimated that the motion takes for zero, for it would hold it there.
+    parameter is estimated that misleads the motion, for it would hold it at zero.
 
     Args:
         labels: what the labels alone say.
@@ -71,11 +71,11 @@ def with_motion(
     if config.use_motion == "auto":
         weak = weak_directions(labels.covariance[:7, :7], state.cTl, config.observability)
         rolling = any(scan.offsets_s.any() for drive in problem.drives for scan in drive.scans)
-        turning = config.assumptions.turning_motion
-        if weak or rolling or turning:
+        misleading = config.assumptions.misleading_motion
+        if weak or rolling or misleading:
             why = "the labels alone leave directions open" if weak else "the scans are rolling sweeps"
-            if turning:
-                why = f"the motion takes {' and '.join(turning)} for zero"
+            if misleading:
+                why = f"the motion takes {' and '.join(misleading)} for zero"
             return WithMotion(labels, diagnostics={"left_out": why})
     return fuse_motion(problem, labels, stretches)
 
@@ -90,7 +90,7 @@ def fuse_motion(
     counts as independent here.
     """
     # 1. The hand-eye solution from the joint one.
-    config, state, covariance = problem.config, labels.solution.state, labels.covariance[:7, :7]
+    config, state = problem.config, labels.solution.state
     try:
         reach_s = config.search.time_offset_s
         guess = Guess(state.cTl, state.time_offsets_s[0])
@@ -98,7 +98,9 @@ def fuse_motion(
     except EstimationError as error:
         return WithMotion(labels, diagnostics={"left_out": str(error)})
     # 2. Do they agree? Motion that does not fit itself contradicts nothing.
-    step = difference(state, motion.state)
+    steps = motion_steps(problem.drives[0].camera, motion.state.cTl)
+    known = KnownCalibration(motion.state, motion.covariance, steps)
+    step, covariance = _disagreement(known, labels)
     chi2 = float(step @ np.linalg.solve(covariance + motion.covariance, step))
     sigmas = np.sqrt(np.diag(motion.covariance))
     facts = {
@@ -118,8 +120,7 @@ def fuse_motion(
         if facts["stretch_p_value"] < FALSE_ALARM:
             return _left_out(labels, _of_stretch(problem.drives, worst, state), facts)
     # 3. Outlines once more, the motion among the factors.
-    factor = gaussian_factor(motion.state, motion.covariance)
-    joint = replace(problem.joint(), centre=problem.prior_centre(state), prior=factor)
+    joint = replace(problem.joint(), centre=problem.prior_centre(state), prior=known)
     solution = solve_joint(joint, state, KERNELS_PX[-1:], problem.progress)
     # 4. The covariance; Birge's ratio, squared, where labels and motion differ by more than theirs allow.
     inflation = chi2 / len(step) if chi2 > UNLIKELY_CHI2 else 1.0
@@ -129,15 +130,17 @@ def fuse_motion(
     return WithMotion(fused, diagnostics={"fused": True, **facts})
 
 
-def gaussian_factor(state: State, covariance: FloatArray) -> gtsam.LinearContainerFactor:
-    """[Log(E_0^-1 E); D - D_0] with a (7, 7) covariance, linear about the state (E_0, D_0)."""
-    root = np.linalg.inv(np.linalg.cholesky(covariance))
-    unit = gtsam.noiseModel.Unit.Create(7)
-    linear = gtsam.JacobianFactor(EXTRINSIC, root[:, :6], time_offset_key(), root[:, 6:], np.zeros(7), unit)
-    point = gtsam.Values()
-    point.insert(EXTRINSIC, state.cTl)
-    point.insert(time_offset_key(), np.array(state.time_offsets_s[:1]))
-    return gtsam.LinearContainerFactor(linear, point)
+def _disagreement(motion: KnownCalibration, labels: JointEstimate) -> tuple[FloatArray, FloatArray]:
+    """Step (7,) from the labels' estimate to what motion says under the parameters that they estimate, and
+    its (7, 7) covariance by the labels."""
+    state, unknowns = labels.solution.state, labels.robust.unknowns
+    jacobian = np.eye(7, unknowns.size)
+    step = difference(state, motion.state)
+    for name, theta in state.nuisances.items():
+        follows = motion.steps.get(name, np.zeros(7))
+        jacobian[:, unknowns.column(nuisance_key(name))] = follows
+        step = step - theta * follows
+    return step, jacobian @ labels.covariance @ jacobian.T
 
 
 def _left_out(labels: JointEstimate, sentence: str, facts: Mapping[str, Any]) -> WithMotion:

@@ -177,8 +177,8 @@ class JointEstimate:
 
     def considered(self, config: AssumptionConfig) -> Considered:
         """What the assumptions that are not estimated add to the covariance."""
-        last = self.solution
-        return considered_by_matches(self.robust, last.pairs, last.values, last.state, config)
+        last, known = self.solution, self.solution.problem.prior
+        return considered_by_matches(self.robust, last.pairs, last.values, last.state, config, known)
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from sst_graph.covariance.cluster_robust import RobustCovariance
 from sst_graph.covariance.match_table import MatchTable
 from sst_graph.graph.building import joint_graph
 from sst_graph.graph.elimination import marginal_covariance
+from sst_graph.graph.known import KnownCalibration
 from sst_graph.graph.matching import GraphConfig, PairMatches
 from sst_graph.graph.nuisances import residual_columns
 from sst_graph.graph.state import State, twist_key
@@ -99,9 +100,9 @@ class AssumptionConfig(AssumptionSigmas):
         return named_sigmas(self.estimate)
 
     @property
-    def turning_motion(self) -> tuple[str, ...]:
-        """Those of the estimated parameters that turn or delay the calibration by motion alone."""
-        return tuple(name for name, _ in self.estimated if ASSUMPTIONS[name].turns_motion)
+    def misleading_motion(self) -> tuple[str, ...]:
+        """Those of the estimated parameters that mislead the calibration by motion alone."""
+        return tuple(name for name, _ in self.estimated if ASSUMPTIONS[name].misleads_motion)
 
 
 @dataclass(frozen=True)
@@ -166,17 +167,22 @@ def considered_by_matches(
     values: gtsam.Values,
     state: State,
     config: AssumptionConfig,
+    known: KnownCalibration | None = None,
 ) -> Considered:
     """Sensitivity of an estimate to every assumption that is not estimated, from its matches.
 
     Args:
         robust: its covariance and matches.
         pairs, values, state: its last frozen problem.
+        known: what it knew beside the matches.
     """
     names = held_at_zero(config.estimate)
     columns = weighted_columns(robust.table, pairs, columns_of(pairs, values, state, names))
     size = 6 + len(state.time_offsets_s)
-    steps = steps_by(names, robust.bread, robust.table.J.T @ columns, size)
+    shared = robust.table.J.T @ columns
+    if known is not None:
+        shared[:7] += known.shared(names)
+    steps = steps_by(names, robust.bread, shared, size)
     return considered_by_steps(steps, config)
 
 

@@ -24,6 +24,7 @@ from sst_graph.factors.motion import CameraTwist, move_groups
 from sst_graph.factors.reprojection import Evaluated, evaluate, evaluate_moved, weigh
 from sst_graph.factors.velocity import transferred
 from sst_graph.graph.building import UNKNOWN_TWIST_SIGMAS, prior_graph
+from sst_graph.graph.known import KnownCalibration
 from sst_graph.graph.linear import information_inverse
 from sst_graph.graph.matching import DriveMatches, GraphConfig
 from sst_graph.graph.state import (
@@ -213,22 +214,22 @@ class FrozenProblem:
         state: State,
         config: GraphConfig,
         guess: State | None = None,
-        prior: gtsam.NonlinearFactor | None = None,
+        prior: KnownCalibration | None = None,
     ) -> None:
         """
         Args:
             matches: by drive, made at ``state``.
             guess: what the weak priors are centred on; by default the state.
-            prior: a further factor on the extrinsic and the first clock's offset.
+            prior: what is known beside the matches.
         """
         self.state = state
         self._classes = sorted({(own.number, c) for own in matches for c in own.classes})
         self._objects = sorted({each for own in matches for each in own.tracked})
         self._priors, values = prior_graph(self._classes, self._objects, state, config, guess)
-        if prior is not None:
-            self._priors.add(prior)
-        # 1. The unknowns: extrinsic, clocks, parameters of assumptions, mask biases of classes and objects.
         self._names = [name for name, _ in named_sigmas(config.estimate)]
+        if prior is not None:
+            self._priors.add(prior.factor(self._names))
+        # 1. The unknowns: extrinsic, clocks, parameters of assumptions, mask biases of classes and objects.
         clocks = [time_offset_key(clock) for clock in range(len(state.time_offsets_s))]
         biases = [bias_key(drive, c) for drive, c in self._classes]
         biases += [object_bias_key(drive, track) for drive, _, track in self._objects]

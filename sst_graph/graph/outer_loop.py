@@ -24,6 +24,7 @@ from sst_graph.factors.robust import RobustKernel
 from sst_graph.fit import OuterIteration
 from sst_graph.graph.building import joint_graph
 from sst_graph.graph.frozen_problem import FrozenPoint, FrozenProblem
+from sst_graph.graph.known import KnownCalibration
 from sst_graph.graph.matching import (
     DriveEdges,
     DriveMatches,
@@ -106,14 +107,14 @@ class JointProblem:
         tracks: their twists, and their objects where those have mask biases.
         config: matches, priors, limits.
         centre: what the weak priors are centred on; the start where it is None.
-        prior: a further factor on the extrinsic and the first clock's offset.
+        prior: what is known beside the matches.
     """
 
     drives: Sequence[Drive]
     tracks: Tracks
     config: JointConfig
     centre: State | None = None
-    prior: gtsam.NonlinearFactor | None = None
+    prior: KnownCalibration | None = None
 
     @classmethod
     def of(cls, drives: Sequence[Drive], config: JointConfig) -> JointProblem:
@@ -158,7 +159,7 @@ class JointSolution:
         where it is asked for."""
         graph, _ = joint_graph(self.pairs, self.frozen.state, self.problem.config.graph, self.centre)
         if self.problem.prior is not None:
-            graph.add(self.problem.prior)
+            graph.add(self.problem.prior.factor([*self.state.nuisances]))
         return graph
 
     @cached_property

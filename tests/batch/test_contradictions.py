@@ -268,7 +268,7 @@ def test_motion_that_contradicts_a_stretch_is_left_out() -> None:
     away[1] = np.radians(20.0)
     differs = SolvedPart(Part(0, (4, 5, 6, 7)), solution.state, PartEstimate(away, np.diag(sigmas**2)))
     for stretches, used in (([agrees], True), ([agrees, differs], False)):
-        labels = replace(JointEstimate.of(solution, objects), covariance=np.diag(sigmas**2))
+        labels = known_to(JointEstimate.of(solution, objects), sigmas)
         found = fuse_motion(parts.problem, labels, stretches)
         assert bool(found.diagnostics.get("fused")) is used
         assert (found.estimate is labels) is not used
@@ -276,12 +276,20 @@ def test_motion_that_contradicts_a_stretch_is_left_out() -> None:
     assert "frames 4 to 7" in found.remarks[0]
 
 
-def test_motion_is_left_out_where_what_it_takes_for_zero_is_estimated() -> None:
+def known_to(labels: JointEstimate, sigmas: FloatArray) -> JointEstimate:
+    """The estimate with these deviations (7,) of extrinsic and time offset."""
+    covariance = labels.covariance.copy()
+    covariance[:7], covariance[:, :7] = 0.0, 0.0
+    covariance[:7, :7] = np.diag(sigmas**2)
+    return replace(labels, covariance=covariance)
+
+
+def test_motion_is_left_out_where_what_misleads_it_is_estimated() -> None:
     parts = parts_of(prepared())
     joint = replace(parts.problem.joint(), config=JointConfig())
     labels = JointEstimate.of(solve_joint(joint, parts.reference, (5.0, 3.0)), parts.problem.objects)
-    labels = replace(labels, covariance=np.diag(np.array([0.001] * 3 + [0.01] * 3 + [0.003]) ** 2))
-    for estimate, used in (((), True), (("k1",), True), (("cx",), False), (("k1", "skew"), False)):
+    labels = known_to(labels, np.array([0.001] * 3 + [0.01] * 3 + [0.003]))
+    for estimate, used in (((), True), (("k1",), True), (("cx",), True), (("k1", "skew"), False)):
         config = replace(CONFIG, method="joint", assumptions=AssumptionConfig(estimate=estimate))
         found = with_motion(replace(parts.problem, config=config), labels, [])
         assert bool(found.diagnostics.get("fused")) is used and not found.reasons

@@ -15,6 +15,7 @@ from sst_graph.drive.preparation import Drive, ScanFeatures
 from sst_graph.factors import RobustKernel
 from sst_graph.graph.building import joint_graph, state_from
 from sst_graph.graph.frozen_problem import FrozenProblem, NormalEquations
+from sst_graph.graph.known import KnownCalibration
 from sst_graph.graph.matching import DriveMatches, GraphConfig, Tracks, associate, edges_of, match_all
 from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
 from sst_graph.objects.dynamic_objects import DynamicObject
@@ -230,7 +231,7 @@ def test_the_optimum_is_the_graphs() -> None:
 def test_a_prior_holds_the_extrinsic() -> None:
     drive, state = moving(False), State(standing_street().truth.cTl, (0.0,))
     there = state.cTl.retract(np.array([0.0, 0.0, 0.0, 0.5, 0.0, 0.0]))
-    prior = gtsam.PriorFactorPose3(EXTRINSIC, there, gtsam.noiseModel.Isotropic.Sigma(6, 1e-6))
+    prior = KnownCalibration(State(there, (0.0,)), np.diag([1e-12] * 6 + [1.0]))
     point, _ = FrozenProblem(matched([drive], state, PLAIN, True), state, PLAIN, prior=prior).optimum(20)
     np.testing.assert_allclose(point.cTl.matrix(), there.matrix(), atol=1e-4)
 

@@ -14,12 +14,11 @@ from stored import written
 from streets import standing_street
 
 from sst_graph.batch import CalibrationConfig, calibrate, calibrate_prepared
-from sst_graph.batch.motion_factor import gaussian_factor
 from sst_graph.cli import main
 from sst_graph.config import with_overrides
 from sst_graph.data import open_source
 from sst_graph.errors import ConfigError, EstimationError
-from sst_graph.graph.state import EXTRINSIC, State, difference, time_offset_key
+from sst_graph.graph.state import State, difference
 from sst_graph.hand_eye.graph import NoiseScales, camera_steps, hand_eye_terms, lidar_paths, pair_motions
 from sst_graph.hand_eye.initialization import motion_starts
 from sst_graph.hand_eye.solution import MotionSolution, alternative, solve_motion
@@ -180,16 +179,6 @@ def test_an_alternative_is_another_solution_that_fits_alike() -> None:
     assert alternative([best, best]) is None
     assert alternative([best, worse]) is None
     assert alternative([best, elsewhere]) is elsewhere
-
-
-def test_belief_by_hand() -> None:
-    """At the state it costs nothing; half of the squared whitened step beside it."""
-    covariance = np.diag(np.array([0.01, 0.02, 0.03, 0.1, 0.2, 0.3, 0.005]) ** 2)
-    factor = gaussian_factor(State(TRUE, (OFFSET_S,)), covariance)
-    values = gtsam.Values()
-    values.insert(EXTRINSIC, TRUE.retract(np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0])))
-    values.insert(time_offset_key(), np.array([OFFSET_S + 0.01]))
-    assert factor.error(values) == pytest.approx(0.5 * (1.0 + 4.0))
 
 
 def _config(**changes: object) -> CalibrationConfig:

@@ -18,10 +18,11 @@ from streets import TRACKED_STREET
 
 from sst_graph import CalibrationConfig, Tracker, TrackerConfig, open_source
 from sst_graph.association.edge_matching import MatchConfig
-from sst_graph.batch.by_edges.problem import POINTS_A_SCAN, KnownCalibration
+from sst_graph.batch.by_edges.problem import POINTS_A_SCAN
 from sst_graph.cli import main
 from sst_graph.factors.alignment import weighted_residuals
 from sst_graph.features.picture_gradients import PictureGradients
+from sst_graph.graph.known import KnownCalibration
 from sst_graph.graph.state import State
 from sst_graph.hand_eye.graph import camera_steps
 from sst_graph.metrics import calibration_errors

@@ -36,6 +36,7 @@ from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.covariance.shared_errors import FEWEST
 from sst_graph.errors import EstimationError
 from sst_graph.factors.robust import RobustKernel
+from sst_graph.graph.known import motion_steps
 from sst_graph.graph.matching import edges_of, match_all
 from sst_graph.graph.outer_loop import JointProblem, support_of
 from sst_graph.graph.state import State, difference
@@ -128,15 +129,11 @@ def lens_steps(
         beside: tests by other data, none of which contradicts anything, that the principal point's are put
             together with. Nothing is tested where that cannot contradict it.
     """
-    problem = edges.whole
-    graph = problem.config.graph
-    estimated = dict(named_sigmas(graph.estimate))
+    estimated = dict(named_sigmas(edges.whole.config.graph.estimate))
     names = [name for name, each in ASSUMPTIONS.items() if each.by_edges and name not in estimated]
     if not config.test or not names:
         return LensTest()
-    graph = replace(graph, estimate=(*graph.estimate, *names))
-    free = replace(problem, config=replace(problem.config, graph=graph))
-    start = replace(state, nuisances={**state.nuisances, **dict.fromkeys(names, 0.0)})
+    free, start = _with_free(edges, state, names)
     # Soft matches follow a wrong lens for many steps. What moves by a fifth of a sigma after the first ones
     # decides nothing where others test the same.
     few = replace(free, config=replace(free.config, max_outer=len(START_KERNELS_PX)))
@@ -149,7 +146,7 @@ def lens_steps(
     except EstimationError:
         return LensTest()
     # Half of the objects, and half of what else is known: but for chance, their optimum is that of the whole.
-    halves = replace(free, prior=edges.known.factor(0.5))
+    halves = replace(free, prior=edges.known.with_share(0.5))
 
     def settled(steps: Mapping[str, FloatArray]) -> bool:
         if beside is None:
@@ -162,7 +159,32 @@ def lens_steps(
         return LensTest()
     findings = [_finding(name, found.nuisances[name], steps[name], config.threshold) for name in names]
     known = sorted((each for each in findings if each is not None), key=lambda each: -each.score)
+    against = [each.assumption.name for each in known if each.contradicted]
+    if against:
+        found = yield from _with_these(edges, state, found, against)
     return LensTest(tuple(known), difference(state, found))
+
+
+def _with_free(edges: EdgesProblem, state: State, names: Sequence[str]) -> tuple[JointProblem, State]:
+    """The problem with parameters as further variables, and a state with these at zero."""
+    problem, graph = edges.whole, edges.whole.config.graph
+    graph = replace(graph, estimate=(*graph.estimate, *names))
+    free = replace(problem, config=replace(problem.config, graph=graph))
+    return free, replace(state, nuisances={**state.nuisances, **dict.fromkeys(names, 0.0)})
+
+
+def _with_these(edges: EdgesProblem, state: State, found: State, names: Sequence[str]) -> Stepwise[State]:
+    """The solution with some parameters free, from that with all of them, or that one where it has none: what
+    the others leave open is no step that these make."""
+    free, start = _with_free(edges, state, names)
+    turns = motion_steps(edges.whole.drives[0].camera, found.cTl)
+    held = [name for name in turns if name in found.nuisances and name not in start.nuisances]
+    turn = sum((found.nuisances[name] * turns[name][:6] for name in held), np.zeros(6))
+    kept = {name: found.nuisances[name] for name in start.nuisances}
+    try:
+        return (yield from _near(free, replace(found, cTl=found.cTl.retract(turn), nuisances=kept)))
+    except EstimationError:
+        return found
 
 
 def _near(problem: JointProblem, start: State) -> Stepwise[State]:

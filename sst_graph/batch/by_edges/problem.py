@@ -13,12 +13,13 @@ import numpy as np
 from sst_graph.association.time_pairing import pair_by_time
 from sst_graph.batch.by_edges.parts import thinned
 from sst_graph.batch.config import CalibrationConfig
-from sst_graph.batch.motion_factor import gaussian_factor
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.drive.edges_of_frames import with_edges
 from sst_graph.drive.preparation import Drive, PrepareConfig, Progress
 from sst_graph.edges.search import KnownRotation, SearchRegion, angle_deg
 from sst_graph.errors import EstimationError
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.graph.known import KnownCalibration, motion_steps
 from sst_graph.graph.matching import DriveEdges, Tracks, edges_of
 from sst_graph.graph.outer_loop import JointProblem
 from sst_graph.graph.state import State, difference
@@ -50,18 +51,6 @@ out [rad, m, s]."""
 _TRANSLATION_SIGMA_M, _FREE_TRANSLATION_SIGMA_M = 0.1, 0.3
 """Prior sigma of the translation around the guess, or around 0 without one: unbounded, weak scenes run away
 along the road [m]."""
-
-
-@dataclass(frozen=True)
-class KnownCalibration:
-    """A Gaussian on extrinsic and time offset: its mean, and its (7, 7) covariance."""
-
-    state: State
-    covariance: FloatArray
-
-    def factor(self, share: float = 1.0) -> gtsam.NonlinearFactor:
-        """In the joint graph, with a share of its information."""
-        return gaussian_factor(self.state, self.covariance / share)
 
 
 @dataclass(frozen=True)
@@ -203,8 +192,8 @@ def edges_problem(
     centre = State(pose, (region.time_offsets_s[0] if offset_known else guess.time_offset_s,))
     guessed = labels.state is None and guess.cTl is not None
     checking = None if labels.has_motion else checking_motion(motion, calibration.config)
-    known = _prior(centre, checking, guessed)
-    whole = replace(joint, centre=centre, prior=known.factor())
+    known = _prior(centre, checking, guessed, drives[0].camera)
+    whole = replace(joint, centre=centre, prior=known)
     scans = [_some_scans(drive, guess.time_offset_s) for drive in drives]
     parts = [drive.part(own) for drive, own in zip(drives, scans, strict=True)]
     tracks = [joint.tracks.part(number, own) for number, own in enumerate(scans)]
@@ -213,9 +202,9 @@ def edges_problem(
 
 
 def checking_motion(motion: MotionSolution | None, config: CalibrationConfig) -> MotionSolution | None:
-    """What motion says, where the result should agree with it: not where a parameter is estimated that motion
-    takes for zero, and that turns or delays what it says."""
-    return None if config.assumptions.turning_motion else motion
+    """What motion says, where the result should agree with it: not where a parameter is estimated that
+    misleads it."""
+    return None if config.assumptions.misleading_motion else motion
 
 
 def _some_scans(drive: Drive, time_offset_s: float) -> list[int]:
@@ -269,11 +258,14 @@ def _region(guess: Guess, motion: MotionSolution | None, time_offsets_s: tuple[f
     return SearchRegion(middle, time_offsets_s, (half[0], half[1], half[2]), known)
 
 
-def _prior(centre: State, motion: MotionSolution | None, guessed: bool) -> KnownCalibration:
+def _prior(
+    centre: State, motion: MotionSolution | None, guessed: bool, camera: PinholeCamera
+) -> KnownCalibration:
     """Motion, and the translation's prior."""
     sigma_m = _TRANSLATION_SIGMA_M if guessed else _FREE_TRANSLATION_SIGMA_M
     sigmas = np.array([10.0] * 3 + [sigma_m] * 3 + [1.0])
     information, state = np.diag(sigmas**-2.0), centre
+    steps: dict[str, FloatArray] = {}
     if motion is not None:
         own = np.linalg.inv(motion.covariance + np.diag(_MOTION_FLOOR**2))
         total = information + own
@@ -281,4 +273,6 @@ def _prior(centre: State, motion: MotionSolution | None, guessed: bool) -> Known
         step = np.linalg.solve(total, information @ difference(motion.state, centre))
         state = motion.state.moved(np.asarray(step, np.float64))
         information = total
-    return KnownCalibration(state, np.asarray(np.linalg.inv(information), np.float64))
+        share = np.linalg.solve(total, own)
+        steps = {name: share @ step for name, step in motion_steps(camera, state.cTl).items()}
+    return KnownCalibration(state, np.asarray(np.linalg.inv(information), np.float64), steps)

@@ -23,9 +23,9 @@ from sst_graph.batch.by_edges.covariance import (
     outline_steps,
 )
 from sst_graph.batch.by_edges.optimum import farther_edges_steps
-from sst_graph.batch.by_edges.problem import KnownCalibration
 from sst_graph.batch.by_edges.reasons import contrast_reasons, edge_contrast_steps, far_reasons
 from sst_graph.covariance.shared_errors import spread_covariance
+from sst_graph.graph.known import KnownCalibration
 from sst_graph.graph.matching import Tracks, edges_of
 from sst_graph.graph.outer_loop import JointProblem
 from sst_graph.graph.state import State
@@ -124,7 +124,7 @@ class Review(SpreadWork[EdgeReview]):
     def steps(self) -> Stepwise[EdgeReview]:
         drive, calibration = of_kind(self.stretch.drive, edges=True), self.config.calibration
         tracks = Tracks([drive]).with_objects(self.stretch.tracks, self.stretch.dynamic)
-        problem = JointProblem([drive], tracks, calibration.joint, self.known.state, self.known.factor())
+        problem = JointProblem([drive], tracks, calibration.joint, self.known.state, self.known)
         return review_steps(problem, self.state, self.stretch.tracks, calibration.seed)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import gtsam
 
-from sst_graph.batch.by_edges.problem import KnownCalibration
+from sst_graph.graph.known import KnownCalibration
 from sst_graph.tracker.by_edges.review import EdgeReview
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.types import Guess, SemanticClass

@@ -275,10 +275,16 @@ def prior_gaussian(
     centre = Point.unbiased(guess.cTl or point.cTl, guess.time_offset_s, classes, point.names)
     vector = information @ point.local(centre)
     if first.known is not None:
-        own = np.linalg.inv(first.known.covariance)
+        known, nothing = first.known, np.zeros(len(point.names))
         mean = dataclasses.replace(
-            point, cTl=first.known.state.cTl, time_offset_s=first.known.state.time_offset_s(0)
+            point,
+            cTl=known.state.cTl,
+            time_offset_s=known.state.time_offset_s(0),
+            parameters=nothing,
         )
-        information[:7, :7] += own
-        vector[:7] += own @ point.local(mean)[:7]
+        jacobian = np.eye(7, len(vector))
+        for column, name in zip(point.parameter_columns, point.names, strict=True):
+            jacobian[:, column] = known.steps.get(name, np.zeros(7))
+        information += jacobian.T @ known.information @ jacobian
+        vector += jacobian.T @ (known.information @ (jacobian @ point.local(mean)))
     return Gaussian(point, information, vector)

@@ -61,17 +61,17 @@ def test_the_right_lens_is_not_contradicted(drive: Drive) -> None:
     assert not found.covariance.any()
 
 
-def test_motion_does_not_hold_a_principal_point_that_is_estimated(drive: Drive) -> None:
+def test_motion_follows_a_principal_point_that_is_estimated_and_holds_no_skew(drive: Drive) -> None:
     truth = simulated(STREET).truth
     guess = Guess(truth.cTl, truth.time_offset_s)
-    for estimate, held in (((), True), (("k1",), True), (("cy",), False)):
+    for estimate, held in (((), True), (("cy",), True), (("skew",), False)):
         config = CalibrationConfig(method="edges", assumptions=AssumptionConfig(estimate=estimate))
         problem = CalibrationProblem.of([drive], guess, config)
         motion = motion_alone([drive], guess, config, None)
         assert motion is not None
         known = edges_problem(problem, motion, LabelEstimate()).known
         pitch_deg = np.degrees(np.sqrt(known.covariance[1, 1]))
-        assert bool(pitch_deg < 5.0) is held
+        assert bool(pitch_deg < 5.0) is held and bool(known.steps) is held
 
 
 def test_a_wrong_principal_point_is_named_with_its_size(drive: Drive) -> None:

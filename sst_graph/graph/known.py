@@ -1,0 +1,77 @@
+"""What is known of a calibration beside the matches, as one more factor of the graph."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations_with_replacement
+
+import gtsam
+import numpy as np
+
+from sst_graph.assumptions import ASSUMPTIONS
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.graph.state import EXTRINSIC, State, nuisance_key, time_offset_key
+from sst_graph.types import FloatArray
+
+
+@dataclass(frozen=True)
+class KnownCalibration:
+    """A Gaussian on extrinsic and first time offset, which may follow parameters of assumptions.
+
+    Attributes:
+        state: its mean, which takes these parameters for 0.
+        covariance: (7, 7).
+        steps: (7,) step from the calibration to the mean by one unit of each of them, by name [rad, m, s].
+    """
+
+    state: State
+    covariance: FloatArray
+    steps: Mapping[str, FloatArray] = field(default_factory=dict)
+
+    @property
+    def information(self) -> FloatArray:
+        """(7, 7)."""
+        return np.asarray(np.linalg.inv(self.covariance), np.float64)
+
+    def with_share(self, share: float) -> KnownCalibration:
+        """The same with a share of its information."""
+        return replace(self, covariance=self.covariance / share)
+
+    def shared(self, names: Sequence[str]) -> FloatArray:
+        """(7, k) information that extrinsic and offset share with parameters."""
+        own = [self.steps.get(name, np.zeros(7)) for name in names]
+        return np.asarray(self.information @ np.reshape(own, (len(names), 7)).T, np.float64)
+
+    def factor(self, free: Sequence[str] = ()) -> gtsam.LinearContainerFactor:
+        """[Log(E_0^-1 E); D - D_0] + s theta, linear about the mean (E_0, D_0).
+
+        Args:
+            free: names of the assumptions whose parameters theta are variables of the graph.
+        """
+        free = [name for name in free if name in self.steps]
+        columns = {EXTRINSIC: np.eye(7)[:, :6], time_offset_key(): np.eye(7)[:, 6:]}
+        columns |= {nuisance_key(name): self.steps[name][:, None] for name in free}
+        # gtsam's Python takes at most three keys at a time; the sum of such pieces is one factor.
+        pieces, information = gtsam.GaussianFactorGraph(), self.information
+        for (i, left), (j, right) in combinations_with_replacement(columns.items(), 2):
+            block = left.T @ information @ right
+            at_i, at_j = np.zeros(left.shape[1]), np.zeros(right.shape[1])
+            if i == j:
+                pieces.add(gtsam.HessianFactor(i, block, at_i, 0.0))
+            else:
+                alone = np.diag(at_i), np.diag(at_j)
+                pieces.add(gtsam.HessianFactor(i, j, alone[0], block, at_i, alone[1], at_j, 0.0))
+        point = gtsam.Values()
+        point.insert(EXTRINSIC, self.state.cTl)
+        point.insert(time_offset_key(), np.array(self.state.time_offsets_s[:1]))
+        for name in free:
+            point.insert(nuisance_key(name), np.zeros(1))
+        return gtsam.LinearContainerFactor(gtsam.HessianFactor(pieces), point)
+
+
+def motion_steps(camera: PinholeCamera, cTl: gtsam.Pose3) -> dict[str, FloatArray]:
+    """(7,) step of a calibration by motion alone by one unit of each parameter that it follows, by name
+    [rad, m, s]."""
+    found = {name: each.motion_step for name, each in ASSUMPTIONS.items()}
+    return {name: step(camera, cTl) for name, step in found.items() if step is not None}
