@@ -54,7 +54,9 @@ def calibrated(motion: Motion, seed: int) -> Calibrated:
         seed=seed, frames=20, width=621, height=188, azimuth_limit_deg=60.0, motion=motion, time_offset_s=0.05
     )
     drive = simulate(config)
-    result = calibrate(drive, drive.nominal, with_overrides(CalibrationConfig(), ["find_causes=false"]))
+    result = calibrate(
+        drive, drive.nominal, with_overrides(CalibrationConfig(), ["find_causes=false", "use_motion=never"])
+    )
     truth = drive.truth
     late_s = result.time_offset_s - truth.time_offset_s
     errors = tangent_error(result.T_camera_lidar, truth.cTl, late_s)

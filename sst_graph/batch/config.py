@@ -61,8 +61,8 @@ class CalibrationConfig(Settings):
     use_motion: UseMotion = setting(
         "auto",
         doc="Whether method joint adds hand-eye constraints from LiDAR and visual odometry. auto: "
-        "where the labels alone determine all unknowns and the scans are not rolling. always: "
-        "where constant speed leaves the offset open; never: where visual odometry is poor.",
+        "where the points of a scan share one time. always: rolling sweeps, too, whose offset it errs "
+        "by some milliseconds; never: where visual odometry is poor.",
     )
     max_range_m: float = setting(
         MAX_RANGE_M,

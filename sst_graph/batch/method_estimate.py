@@ -64,7 +64,7 @@ class MethodEstimate:
         frames: that took part.
         reasons: why the estimate may be wrong altogether; any makes the status ``not_converged``.
         remarks: notes for the reader that do not change the status.
-        by_static_objects: (7, 7) covariance by static objects alone, and by motion where always used.
+        by_static_objects: (7, 7) covariance by static objects alone, and by motion where used.
         drive_offsets: an offset for each drive, with ``time_offset_per_drive``.
         by_drive: how well each of them is known.
         diagnostics: JSON-able numbers about the run.

@@ -13,7 +13,6 @@ from sst_graph.batch.contradictions import FALSE_ALARM
 from sst_graph.batch.part_solver import SolvedPart
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.covariance.contradiction import Difference, PartEstimate, name_step
-from sst_graph.covariance.observability import weak_directions
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
 from sst_graph.graph.known import KnownCalibration, motion_steps
@@ -57,9 +56,9 @@ def with_motion(
 ) -> WithMotion:
     """The estimate with the motion in its graph, where the settings allow it and the two agree.
 
-    With ``use_motion=auto`` the motion is used where the labels determine all unknowns by themselves and the
-    points of a scan share one time: a rolling sweep is compensated by the very motion. Nor is it used where a
-    parameter is estimated that misleads the motion, for it would hold it at zero.
+    With ``use_motion=auto`` the motion is used where the points of a scan share one time: a rolling sweep is
+    compensated by the very motion. Nor is it used where a parameter is estimated that misleads the motion,
+    for it would hold it at zero.
 
     Args:
         labels: what the labels alone say.
@@ -69,13 +68,12 @@ def with_motion(
     if not may_use_motion(config):
         return WithMotion(labels)
     if config.use_motion == "auto":
-        weak = weak_directions(labels.covariance[:7, :7], state.cTl, config.observability)
         rolling = any(scan.offsets_s.any() for drive in problem.drives for scan in drive.scans)
         misleading = config.assumptions.misleading_motion
-        if weak or rolling or misleading:
-            why = "the labels alone leave directions open" if weak else "the scans are rolling sweeps"
-            if misleading:
-                why = f"the motion takes {' and '.join(misleading)} for zero"
+        if rolling or misleading:
+            why = f"the motion takes {' and '.join(misleading)} for zero"
+            if not misleading:
+                why = "the scans are rolling sweeps"
             return WithMotion(labels, diagnostics={"left_out": why})
     return fuse_motion(problem, labels, stretches)
 
@@ -125,8 +123,7 @@ def fuse_motion(
     # 4. The covariance; Birge's ratio, squared, where labels and motion differ by more than theirs allow.
     inflation = chi2 / len(step) if chi2 > UNLIKELY_CHI2 else 1.0
     fused = JointEstimate.of(solution, problem.objects)
-    static = fused.by_static_objects if config.use_motion == "always" else labels.by_static_objects
-    fused = replace(fused, covariance=inflation * fused.covariance, by_static_objects=static)
+    fused = replace(fused, covariance=inflation * fused.covariance)
     return WithMotion(fused, diagnostics={"fused": True, **facts})
 
 

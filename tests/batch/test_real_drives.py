@@ -44,7 +44,7 @@ def test_a_slow_drive_with_a_stop(shift: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not PARKED.is_dir(), reason="no ../shared")
-@pytest.mark.parametrize(("use_motion", "status"), [("auto", "unobservable"), ("always", "ok")])
+@pytest.mark.parametrize(("use_motion", "status"), [("never", "unobservable"), ("auto", "ok")])
 def test_a_steady_drive(use_motion: str, status: str) -> None:
     """At one speed the labels do not separate forward and time offset; the pitching of the body does, where
     motion is used."""
@@ -57,7 +57,7 @@ def test_a_steady_drive(use_motion: str, status: str) -> None:
     assert result.status == status
     assert errors.qad_deg < 0.2
     if status == "ok":
-        assert errors.atd_m < 0.1
-        assert errors.time_offset_s is not None and abs(errors.time_offset_s) < 0.015
+        assert errors.atd_m < 0.03
+        assert errors.time_offset_s is not None and abs(errors.time_offset_s) < 0.008
     else:
         assert "1 m equals" in result.reasons[0]

@@ -225,7 +225,7 @@ def test_the_joint_method_hears_the_motion(street: Path) -> None:
     weak = ["search.enabled=false", "noise.side_sigma_px=10"]
     settings = with_overrides(CalibrationConfig(), weak)
     deaf = calibrate(source, source.nominal, dataclasses.replace(settings, use_motion="never"))
-    hearing = calibrate(source, source.nominal, dataclasses.replace(settings, use_motion="always"))
+    hearing = calibrate(source, source.nominal, dataclasses.replace(settings, use_motion="auto"))
     assert hearing.diagnostics["motion"]["fused"] is True and not deaf.diagnostics["motion"]
     assert hearing.covariance[6, 6] < deaf.covariance[6, 6]
     truth = source.truth

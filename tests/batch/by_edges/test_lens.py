@@ -114,7 +114,7 @@ def test_another_optimum_with_fewer_edges_is_no_wrong_lens() -> None:
     result = calibrate(street, street.nominal, CalibrationConfig(method="edges"))
     found = result.diagnostics["assumptions"]
     assert {name for name, each in found.items() if each.get("contradicted")} == set()
-    assert abs(found["cy"]["estimate"]) < 2.5
+    assert abs(found["cy"]["estimate"]) < 3.5  # half way to the other optimum
     assert result.status != "not_converged", result.reasons
 
 
