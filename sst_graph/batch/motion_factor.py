@@ -64,7 +64,7 @@ def with_motion(
         labels: what the labels alone say.
         stretches: of the drives, each solved by itself; steps are from that solution.
     """
-    config, state = problem.config, labels.solution.state
+    config = problem.config
     if not may_use_motion(config):
         return WithMotion(labels)
     if config.use_motion == "auto":

@@ -8,6 +8,7 @@ the labels, which its covariance does not show.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -329,7 +330,7 @@ def poor_fit(explained: float, concentration: float, rotation_observable: bool) 
     """
     least_explained = MIN_EXPLAINED if rotation_observable else MIN_EXPLAINED_VAGUE
     return [
-        f"only {100.0 * share:.0f} % {what} (expected {100.0 * least:.0f} % or more): "
+        f"only {math.floor(100.0 * share)} % {what} (expected {100.0 * least:.0f} % or more): "
         "the pose may be wrong altogether"
         for share, least, what in (
             (explained, least_explained, "of the boundary points in view meet a contour"),

@@ -29,7 +29,7 @@ from sst_graph.graph.outer_loop import JointConfig, solve_joint
 from sst_graph.graph.state import State
 from sst_graph.result import CalibrationResult
 from sst_graph.simulator import SimulatedDrive, SimulationConfig
-from sst_graph.types import Frame, Guess, Source
+from sst_graph.types import FloatArray, Frame, Guess, Source
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 STOP = DATA / "kitti_2011_09_26_stop"
