@@ -4,7 +4,8 @@
     OMP_NUM_THREADS=1 python -m studies.principal_point own-547 --prevalence 0.1
 
 The prevalence is the probability beforehand that the camera matrix's principal point is wrong
-(:mod:`sst_graph.covariance.broken_assumptions`). Drives are those of :mod:`studies.edges_streets`, by labels.
+(:mod:`sst_graph.covariance.broken_assumptions`). Drives are those of :mod:`studies.edges_streets`, by labels or
+with ``--method edges``.
 """
 
 from __future__ import annotations
@@ -31,8 +32,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("names", nargs="+")
     parser.add_argument("--prevalence", nargs="+", type=float, default=PREVALENCES)
+    parser.add_argument("--method", choices=["joint", "edges"], default="joint")
     options = parser.parse_args()
-    config = CalibrationConfig(method="joint")
+    config = CalibrationConfig(method=options.method)
     print("| drive | cx, cy off by | prevalence | status | worst axis | NEES / 7 | sigmas |")
     print("|---" * 7 + "|")
     for name in options.names:

@@ -19,7 +19,7 @@ from sst_graph.batch.causes import with_causes
 from sst_graph.batch.method_estimate import guess_as_result
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.data.kept_drive import KeptDrive
-from sst_graph.diagnosis import Fit, other_camera, preflight
+from sst_graph.diagnosis import Fit, labels, other_camera, preflight
 from sst_graph.diagnosis.cameras import image_size, uncalibrated
 from sst_graph.diagnosis.clocks import stamps, two_clocks
 from sst_graph.diagnosis.hypotheses import best_hypothesis
@@ -413,6 +413,20 @@ def test_a_common_shift_is_measured(right: int, down: int) -> None:
     assert found is not None and found.within_reach
     assert abs(found.right_px - right) < 4.0 * found.sigma_px[0] < 1.6
     assert abs(found.down_px - down) < 4.0 * found.sigma_px[1] < 1.6
+
+
+@pytest.mark.parametrize(("right", "named"), [(0, False), (2, True), (-3, True)])
+def test_masks_beside_their_pictures_are_named_from_two_pixels_on(right: int, named: bool) -> None:
+    scenes = [scene(seed) for seed in range(4)]
+    profiles = [
+        profile
+        for mask, picture in scenes
+        for profile in contour_profiles(np.roll(mask, right, 1), picture, SemanticClass.VEHICLE)
+    ]
+    found = labels.shifted_masks(mask_shift(profiles))
+    assert (found is not None) is named
+    if found is not None:
+        assert ("right" if right > 0 else "left") in found.sentence
 
 
 def test_blank_pictures_determine_no_shift() -> None:
