@@ -4,8 +4,8 @@
     OMP_NUM_THREADS=1 python -m studies.principal_point own-547 --prevalence 0.1
 
 The prevalence is the probability beforehand that the camera matrix's principal point is wrong
-(:mod:`sst_graph.covariance.broken_assumptions`). Drives are those of :mod:`studies.edges_streets`, by labels or
-with ``--method edges``.
+(:mod:`sst_graph.covariance.broken_assumptions`). Drives are those of :mod:`studies.edges_streets`, by labels
+or with ``--method edges``.
 """
 
 from __future__ import annotations

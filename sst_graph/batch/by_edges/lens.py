@@ -7,7 +7,8 @@ estimate over its deviation decides (Wald), by Student's t with one degree of fr
 half-samples.
 
 A lens that is contradicted is a reason against the estimate where it matters: where the estimate moves
-farther than it is known when the lens is free. Where it moves less far, that step is added to the covariance.
+farther than it is known when those parameters are free that are contradicted. Where it moves less far, that
+step is added to the covariance. What the others leave open is considered.
 
 An estimate by labels is tested, too, by edges of some of its frames: those know the principal point several
 times as well as the outlines of a few vehicles.
@@ -68,7 +69,8 @@ class LensTest:
 
     Attributes:
         findings: the most contradicted first; none where nothing was tested.
-        step: (7,) from the estimate to that with the lens free [rad, m, s].
+        step: (7,) from the estimate to that with the contradicted parameters free, or with all of them where
+            none is [rad, m, s].
     """
 
     findings: tuple[ParameterTest, ...] = ()
