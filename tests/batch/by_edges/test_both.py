@@ -366,7 +366,8 @@ def test_a_street_with_labels_in_every_second_frame() -> None:
     assert errors.nees is not None and errors.nees.joint < 2.5 * 7
     said = result.diagnostics["both"]
     sigmas = np.sqrt(np.diag(result.covariance))
-    assert all((sigmas < np.array(said[kind]["sigmas"])).all() for kind in ("labels", "edges"))
+    # Labels with motion know some axes so well that edges add nothing to them.
+    assert all((sigmas < 1.01 * np.array(said[kind]["sigmas"])).all() for kind in ("labels", "edges"))
     assert 10 <= len(result.frames_used) <= 16
     labels, edges = result.fits
     assert edges.by_edges and not labels.by_edges and labels.quality.share > 0.6
