@@ -109,10 +109,9 @@ class SolvedProblem:
         Raises:
             EstimationError: too few matches at any step.
         """
-        joint, centre = self.problem.config.joint, self.problem.prior_centre(self.solution.state)
-        graph = replace(joint.graph, estimate=(*joint.graph.estimate, *names))
-        free = replace(joint, max_outer=most_outer, graph=graph)
-        return solve_joint(replace(self.problem.joint(), config=free, centre=centre), start, kernels_px)
+        free, centre = self.problem.joint().estimating(names), self.problem.prior_centre(self.solution.state)
+        config = replace(free.config, max_outer=most_outer)
+        return solve_joint(replace(free, config=config, centre=centre), start, kernels_px)
 
 
 FurtherTests = Callable[[CalibrationProblem, State, Sequence[ParameterTest]], tuple[ParameterTest, ...]]
@@ -180,8 +179,7 @@ class LinearProblem:
     @classmethod
     def of(cls, problem: SolvedProblem, names: Sequence[str]) -> LinearProblem:
         """The problem with these parameters free."""
-        before = problem.solution.state
-        start = replace(before, nuisances={**before.nuisances, **dict.fromkeys(names, 0.0)})
+        start = problem.solution.state.with_parameters(names)
         solution = problem.solve_with(names, start, _ALL_FREE_KERNELS_PX, len(_ALL_FREE_KERNELS_PX))
         graph, at, pairs = solution.graph, solution.values, solution.pairs
         unknowns = Unknowns.of(solution.state, pairs)

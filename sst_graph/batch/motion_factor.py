@@ -68,13 +68,11 @@ def with_motion(
     if not may_use_motion(config):
         return WithMotion(labels)
     if config.use_motion == "auto":
-        rolling = any(scan.offsets_s.any() for drive in problem.drives for scan in drive.scans)
-        misleading = config.assumptions.misleading_motion
-        if rolling or misleading:
+        if misleading := config.assumptions.misleading_motion:
             why = f"the motion takes {' and '.join(misleading)} for zero"
-            if not misleading:
-                why = "the scans are rolling sweeps"
             return WithMotion(labels, diagnostics={"left_out": why})
+        if any(scan.offsets_s.any() for drive in problem.drives for scan in drive.scans):
+            return WithMotion(labels, diagnostics={"left_out": "the scans are rolling sweeps"})
     return fuse_motion(problem, labels, stretches)
 
 
@@ -131,12 +129,11 @@ def _disagreement(motion: KnownCalibration, labels: JointEstimate) -> tuple[Floa
     """Step (7,) from the labels' estimate to what motion says under the parameters that they estimate, and
     its (7, 7) covariance by the labels."""
     state, unknowns = labels.solution.state, labels.robust.unknowns
+    names = list(state.nuisances)
+    follows = motion.columns(names)
+    step = difference(state, motion.state) - follows @ np.array([state.nuisances[name] for name in names])
     jacobian = np.eye(7, unknowns.size)
-    step = difference(state, motion.state)
-    for name, theta in state.nuisances.items():
-        follows = motion.steps.get(name, np.zeros(7))
-        jacobian[:, unknowns.column(nuisance_key(name))] = follows
-        step = step - theta * follows
+    jacobian[:, [unknowns.column(nuisance_key(name)) for name in names]] = follows
     return step, jacobian @ labels.covariance @ jacobian.T
 
 

@@ -18,9 +18,8 @@ _THINGS = (*MOVABLE_CLASSES, SemanticClass.POLE, SemanticClass.SIGN)
 _NOTHING_ELSE = 0.95
 """Share of all points or pixels in one of them: the ground alone takes more than the rest."""
 _LEAST_SHIFT_PX = 1.0
-"""Contours follow the picture's edges over a pixel by themselves [px]. With 1.5 here masks 2 px to the right
-were taken for right, and the result for 4.7 and 5.3 sigmas better than it was, on two drives of three of an
-independent simulator."""
+"""Contours follow the picture's edges over a pixel by themselves [px]. With 1.5 here, masks 2 px to the right
+pass on two drives of three of an independent simulator, whose results are ok and 4.7 and 5.3 sigmas off."""
 _SIGMAS = 4.0
 _LEAST_CONTRAST = 1.3
 """Of masks over their own pictures: 1.6 and more on streets and real drives; over others 0.3 to 1.1 ..."""

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations_with_replacement
 
 import gtsam
 import numpy as np
 
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.factors.camera import PinholeCamera
+from sst_graph.graph.linear import quadratic_factor
 from sst_graph.graph.state import EXTRINSIC, State, nuisance_key, time_offset_key
 from sst_graph.types import FloatArray
 
@@ -38,10 +38,14 @@ class KnownCalibration:
         """The same with a share of its information."""
         return replace(self, covariance=self.covariance / share)
 
+    def columns(self, names: Sequence[str]) -> FloatArray:
+        """(7, k) steps by parameters; 0 by those that the mean does not follow."""
+        own = [self.steps.get(name, np.zeros(7)) for name in names]
+        return np.asarray(np.reshape(own, (len(names), 7)).T, np.float64)
+
     def shared(self, names: Sequence[str]) -> FloatArray:
         """(7, k) information that extrinsic and offset share with parameters."""
-        own = [self.steps.get(name, np.zeros(7)) for name in names]
-        return np.asarray(self.information @ np.reshape(own, (len(names), 7)).T, np.float64)
+        return np.asarray(self.information @ self.columns(names), np.float64)
 
     def factor(self, free: Sequence[str] = ()) -> gtsam.LinearContainerFactor:
         """[Log(E_0^-1 E); D - D_0] + s theta, linear about the mean (E_0, D_0).
@@ -49,25 +53,16 @@ class KnownCalibration:
         Args:
             free: names of the assumptions whose parameters theta are variables of the graph.
         """
-        free = [name for name in free if name in self.steps]
-        columns = {EXTRINSIC: np.eye(7)[:, :6], time_offset_key(): np.eye(7)[:, 6:]}
-        columns |= {nuisance_key(name): self.steps[name][:, None] for name in free}
-        # gtsam's Python takes at most three keys at a time; the sum of such pieces is one factor.
-        pieces, information = gtsam.GaussianFactorGraph(), self.information
-        for (i, left), (j, right) in combinations_with_replacement(columns.items(), 2):
-            block = left.T @ information @ right
-            at_i, at_j = np.zeros(left.shape[1]), np.zeros(right.shape[1])
-            if i == j:
-                pieces.add(gtsam.HessianFactor(i, block, at_i, 0.0))
-            else:
-                alone = np.diag(at_i), np.diag(at_j)
-                pieces.add(gtsam.HessianFactor(i, j, alone[0], block, at_i, alone[1], at_j, 0.0))
+        names = [name for name in free if name in self.steps]
+        jacobian = np.hstack([np.eye(7), self.columns(names)])
+        variables = [(EXTRINSIC, slice(0, 6)), (time_offset_key(), slice(6, 7))]
+        variables += [(nuisance_key(name), slice(7 + k, 8 + k)) for k, name in enumerate(names)]
         point = gtsam.Values()
         point.insert(EXTRINSIC, self.state.cTl)
         point.insert(time_offset_key(), np.array(self.state.time_offsets_s[:1]))
-        for name in free:
+        for name in names:
             point.insert(nuisance_key(name), np.zeros(1))
-        return gtsam.LinearContainerFactor(gtsam.HessianFactor(pieces), point)
+        return quadratic_factor(variables, jacobian.T @ self.information @ jacobian, point)
 
 
 def motion_steps(camera: PinholeCamera, cTl: gtsam.Pose3) -> dict[str, FloatArray]:

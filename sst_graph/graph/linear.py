@@ -1,4 +1,5 @@
-"""Matrices of unknowns whose units differ by orders of magnitude: scaled to a unit diagonal, then inverted.
+"""Matrices of unknowns whose units differ by orders of magnitude: scaled to a unit diagonal, then inverted;
+and as factors.
 
 With radians, metres, seconds and pixels in one information matrix, its condition number is near 1e9 although
 no direction is unobservable; scaled, it is small.
@@ -7,8 +8,9 @@ no direction is unobservable; scaled, it is small.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import groupby
+from itertools import combinations, groupby
 
+import gtsam
 import numpy as np
 
 from sst_graph.types import FloatArray, IntArray
@@ -62,6 +64,32 @@ def covariance_root(P: FloatArray) -> tuple[FloatArray, FloatArray]:
     known = values > 1e-12 * max(float(values[-1]), _LEAST_DIAGONAL)
     sizes = np.sqrt(values[known])
     return vectors[:, known] * sizes / scale[:, None], (vectors[:, known] / sizes).T * scale
+
+
+def quadratic_factor(
+    variables: Sequence[tuple[int, slice]], information: FloatArray, point: gtsam.Values
+) -> gtsam.LinearContainerFactor:
+    """Half of x' information x as one factor, x being the step from a point.
+
+    Args:
+        variables: key of each, and its rows of ``information``.
+        information: (n, n).
+        point: a value of each variable.
+    """
+    # gtsam's Python takes at most three keys at a time; the sum of such pieces is one factor.
+    pieces = gtsam.GaussianFactorGraph()
+    for key, a in variables:
+        own = information[a, a]
+        pieces.add(gtsam.HessianFactor(key, own, np.zeros(len(own)), 0.0))
+    for (key, a), (other, b) in combinations(variables, 2):
+        m, n = a.stop - a.start, b.stop - b.start
+        nothing = np.zeros((m, m)), np.zeros(m), np.zeros((n, n)), np.zeros(n)
+        pieces.add(
+            gtsam.HessianFactor(
+                key, other, nothing[0], information[a, b], nothing[1], nothing[2], nothing[3], 0.0
+            )
+        )
+    return gtsam.LinearContainerFactor(gtsam.HessianFactor(pieces), point)
 
 
 def scattered(n: int, places: Sequence[IntArray], *blocks: Sequence[FloatArray]) -> list[FloatArray]:

@@ -123,6 +123,12 @@ class JointProblem:
         by_object = config.graph.object_bias_sigma_px > 0.0
         return cls(drives, Tracks(drives, [object_tracks(d) for d in drives] if by_object else None), config)
 
+    def estimating(self, names: Sequence[str]) -> JointProblem:
+        """The problem with the parameters of further assumptions as variables, their spans as priors."""
+        graph = self.config.graph
+        graph = replace(graph, estimate=(*graph.estimate, *names))
+        return replace(self, config=replace(self.config, graph=graph))
+
 
 @dataclass(frozen=True)
 class JointSolution:

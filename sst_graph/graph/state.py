@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import gtsam
@@ -89,6 +89,10 @@ class State:
     def moved(self, step: FloatArray) -> State:
         """Extrinsic and first time offset a step (7,) away, without anything else."""
         return State(self.cTl.retract(step[:6]), (self.time_offsets_s[0] + float(step[6]),))
+
+    def with_parameters(self, names: Sequence[str]) -> State:
+        """The state with further parameters of assumptions, at zero."""
+        return replace(self, nuisances={**self.nuisances, **dict.fromkeys(names, 0.0)})
 
     def towards(self, other: State, share: float) -> State:
         """Interpolation from this state (share 0) to another one (1), which has all of this one's biases."""

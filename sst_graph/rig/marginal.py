@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from typing import Any
 
 import gtsam
@@ -14,7 +13,7 @@ from sst_graph.errors import ConfigError
 from sst_graph.factors import FactorError
 from sst_graph.factors.arguments import checked_type, described
 from sst_graph.factors.custom.variables import checked_keys
-from sst_graph.graph.linear import information_inverse
+from sst_graph.graph.linear import information_inverse, quadratic_factor
 from sst_graph.graph.state import time_offset_key
 from sst_graph.rig.influences import UNKNOWNS
 from sst_graph.types import ByValue, FloatArray
@@ -105,20 +104,7 @@ class RigMarginal(ByValue):
             E, D = keys[name]
             at = UNKNOWNS * i
             variables += [(E, slice(at, at + 6)), (D, slice(at + 6, at + 7))]
-        # gtsam's Python takes at most three keys at a time; the sum of such pieces is one factor.
-        pieces = gtsam.GaussianFactorGraph()
-        for key, a in variables:
-            own = information[a, a]
-            pieces.add(gtsam.HessianFactor(key, own, np.zeros(len(own)), 0.0))
-        for (key, a), (other, b) in combinations(variables, 2):
-            m, n = a.stop - a.start, b.stop - b.start
-            nothing = np.zeros((m, m)), np.zeros(m), np.zeros((n, n)), np.zeros(n)
-            pieces.add(
-                gtsam.HessianFactor(
-                    key, other, nothing[0], information[a, b], nothing[1], nothing[2], nothing[3], 0.0
-                )
-            )
-        return gtsam.LinearContainerFactor(gtsam.HessianFactor(pieces), self.point(keys))
+        return quadratic_factor(variables, information, self.point(keys))
 
     def of_camera(self, name: str) -> FloatArray:
         """(7, 7) covariance of one camera."""

@@ -70,7 +70,7 @@ class LensTest:
     Attributes:
         findings: the most contradicted first; none where nothing was tested.
         step: (7,) from the estimate to that with the contradicted parameters free, or with all of them where
-            none is [rad, m, s].
+            none is, or where others test the same [rad, m, s].
     """
 
     findings: tuple[ParameterTest, ...] = ()
@@ -135,7 +135,7 @@ def lens_steps(
     names = [name for name, each in ASSUMPTIONS.items() if each.by_edges and name not in estimated]
     if not config.test or not names:
         return LensTest()
-    free, start = _with_free(edges, state, names)
+    free, start = edges.whole.estimating(names), state.with_parameters(names)
     # Soft matches follow a wrong lens for many steps. What moves by a fifth of a sigma after the first ones
     # decides nothing where others test the same.
     few = replace(free, config=replace(free.config, max_outer=len(START_KERNELS_PX)))
@@ -162,23 +162,15 @@ def lens_steps(
     findings = [_finding(name, found.nuisances[name], steps[name], config.threshold) for name in names]
     known = sorted((each for each in findings if each is not None), key=lambda each: -each.score)
     against = [each.assumption.name for each in known if each.contradicted]
-    if against:
+    if against and beside is None:
         found = yield from _with_these(edges, state, found, against)
     return LensTest(tuple(known), difference(state, found))
-
-
-def _with_free(edges: EdgesProblem, state: State, names: Sequence[str]) -> tuple[JointProblem, State]:
-    """The problem with parameters as further variables, and a state with these at zero."""
-    problem, graph = edges.whole, edges.whole.config.graph
-    graph = replace(graph, estimate=(*graph.estimate, *names))
-    free = replace(problem, config=replace(problem.config, graph=graph))
-    return free, replace(state, nuisances={**state.nuisances, **dict.fromkeys(names, 0.0)})
 
 
 def _with_these(edges: EdgesProblem, state: State, found: State, names: Sequence[str]) -> Stepwise[State]:
     """The solution with some parameters free, from that with all of them, or that one where it has none: what
     the others leave open is no step that these make."""
-    free, start = _with_free(edges, state, names)
+    free, start = edges.whole.estimating(names), state.with_parameters(names)
     turns = motion_steps(edges.whole.drives[0].camera, found.cTl)
     held = [name for name in turns if name in found.nuisances and name not in start.nuisances]
     turn = sum((found.nuisances[name] * turns[name][:6] for name in held), np.zeros(6))

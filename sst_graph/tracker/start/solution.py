@@ -283,8 +283,7 @@ def prior_gaussian(
             parameters=nothing,
         )
         jacobian = np.eye(7, len(vector))
-        for column, name in zip(point.parameter_columns, point.names, strict=True):
-            jacobian[:, column] = known.steps.get(name, np.zeros(7))
+        jacobian[:, list(point.parameter_columns)] = known.columns(point.names)
         information += jacobian.T @ known.information @ jacobian
         vector += jacobian.T @ (known.information @ (jacobian @ point.local(mean)))
     return Gaussian(point, information, vector)
