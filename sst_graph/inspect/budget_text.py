@@ -26,20 +26,26 @@ _LEAST_SHARE = 0.01
 """Assumptions and shifts that give less than this share of every variance are not shown."""
 
 
-def budget_lines(result: CalibrationResult) -> list[str]:
-    """A line a part: its largest sigma among the rotations and among the translations, and the offset's."""
-    parts = _parts(result)
-    if not parts:
-        return []
+def budget_rows(result: CalibrationResult) -> list[tuple[str, str, str, str]]:
+    """Name of each part, its largest sigma among the rotations [deg] and among the translations [cm], and
+    that of the time offset [ms]; empty where the result has no parts."""
     total = np.diag(result.covariance)
-    lines = ["where the sigmas come from (largest axis)     rotation  translation  time offset"]
-    for name, sigmas in parts.items():
+    rows = []
+    for name, sigmas in _parts(result).items():
         if name in (*ASSUMPTIONS, SHIFTS) and (sigmas**2 < _LEAST_SHARE * total).all():
             continue
         rotation, translation = np.degrees(sigmas[:3].max()), 100.0 * sigmas[3:6].max()
         label = printable(name) if name not in ASSUMPTIONS else _label(name, result)
-        lines.append(f"  {label:<44}{rotation:>7.3f} deg {translation:>8.2f} cm {1e3 * sigmas[6]:>9.2f} ms")
-    return lines
+        rows.append((label, f"{rotation:.3f} deg", f"{translation:.2f} cm", f"{1e3 * sigmas[6]:.2f} ms"))
+    return rows
+
+
+def budget_lines(result: CalibrationResult) -> list[str]:
+    """The same as lines of text under a head."""
+    rows = budget_rows(result)
+    head = "where the sigmas come from (largest axis)     rotation  translation  time offset"
+    lines = [f"  {label:<44}{turn:>11} {shift:>11} {offset:>12}" for label, turn, shift, offset in rows]
+    return [head, *lines] if lines else []
 
 
 def estimated_lines(result: CalibrationResult) -> list[str]:

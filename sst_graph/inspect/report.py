@@ -32,6 +32,8 @@ _WITHOUT_LABELS = (
 """What the parts of the sigmas mean."""
 
 
+_ABOVE = "the start", "the data's own calibration, where there is one (the result had no start)"
+"""What the upper picture of an overlay shows: of a result with a start, and of one without."""
 OWN_CALIBRATION = "the data's own calibration and stamps (a reference, not the truth)"
 """Name of what a drive without a known truth is compared with."""
 
@@ -51,6 +53,12 @@ class Comparison:
 
 def summary(result: CalibrationResult, comparison: Comparison | None = None) -> str:
     """The result in a dozen lines: numbers with sigmas, status, unobservable directions."""
+    rows = summary_rows(result, comparison)
+    return "\n".join(f"{name:<15} {text}".rstrip() for name, text in rows)
+
+
+def summary_rows(result: CalibrationResult, comparison: Comparison | None = None) -> list[tuple[str, str]]:
+    """The lines of the summary, each as its name and its text; a line that continues another has no name."""
     rows = [
         ("status", result.status),
         ("method", f"{result.method}, {_frames(result)}"),
@@ -81,14 +89,15 @@ def summary(result: CalibrationResult, comparison: Comparison | None = None) -> 
     for weak in result.weak_directions:
         if not any(weak.sentence in reason for reason in result.reasons):
             rows += [("weak", weak.sentence), ("", weak.advice)]
-    return "\n".join(f"{name:<15} {text}".rstrip() for name, text in rows)
+    return rows
 
 
 def error_lines(errors: CalibrationErrors) -> list[str]:
     """The errors, one metric a line, in degrees, centimetres and milliseconds."""
     lines = [
-        f"rotation     {errors.qad_deg:.3f} deg (QAD), {errors.aead_deg:.3f} deg (AEAD)",
-        f"translation  {100.0 * errors.atd_m:.2f} cm (ATD)",
+        f"rotation     {errors.qad_deg:.3f} deg (QAD: the whole angle), "
+        f"{errors.aead_deg:.3f} deg (AEAD: mean of roll, pitch and yaw)",
+        f"translation  {100.0 * errors.atd_m:.2f} cm (ATD: mean of x, y and z)",
     ]
     if errors.time_offset_s is not None:
         lines.append(f"time offset  {1e3 * errors.time_offset_s:+.2f} ms")
@@ -131,8 +140,9 @@ def markdown_report(result: CalibrationResult, comparison: Comparison | None, pi
     if pictures:
         blocks += [
             "## Before and after",
-            "Above the start, below the result. Vehicle points: green inside the image's vehicle mask, red "
-            "outside; the contour is the mask's. Without labels: points by depth, red near, blue far.",
+            f"Above {_ABOVE[result.initial is None]}, below the result. Vehicle points: green inside the "
+            "image's vehicle mask, red outside; the contour is the mask's. Without labels: points by depth, "
+            "red near, blue far.",
             "\n\n".join(f"![{name}]({name})" for name in pictures),
         ]
     versions = ", ".join(f"{name} {number}" for name, number in result.versions.items())

@@ -19,8 +19,10 @@ from sst_graph.viz.matplotlib_figure import figure_class
 
 WIDTH, HEIGHT = 400, 260
 """Of a chart, in its own units: the page stretches it. Text is 13 units high, as in page.css."""
+BROAD = 1000
+"""Width of a chart that is as wide as a broad page, in the same units."""
 _RIGHT, _TOP, _BOTTOM = 14, 12, 44
-_TICKS = 5
+_TICKS, _WHOLE_TICKS = 5, 16
 _COLOURS = {
     name: f"#0101{k:02x}" for k, name in enumerate(("a", "b", "c", "good", "bad", "muted", "rule"), 1)
 }
@@ -84,6 +86,7 @@ class Chart:
     ) -> None:
         self.x, self.y = _wide(x), _wide(y)
         self.labels, self.alt, self.down, self.square = labels, alt, down, square
+        self._counted = False
         self._marks: list[_Mark] = []
 
     def line(self, x: ArrayLike, y: ArrayLike, colour: str, name: str = "", dashed: bool = False) -> None:
@@ -137,52 +140,63 @@ class Chart:
         """A horizontal line."""
         self.line(self.x, (y, y), colour, name, dashed=True)
 
-    def svg(self) -> str:
-        """The chart; where matplotlib does not start, a sentence that says why."""
+    def count_along_x(self) -> None:
+        """x is the number of a thing: ticks at 1, 2, 3, ..., or, of many, at every second or third."""
+        self._counted = True
+
+    def svg(self, width: int = WIDTH) -> str:
+        """The chart; where matplotlib does not start, a sentence that says why.
+
+        Args:
+            width: in its own units.
+        """
         try:
             figure_class()
         except (MissingDependencyError, ConfigError) as error:
             return paragraph(f"Not drawn: {error}", "note")
-        return self._for_the_page(*self._drawn())
+        return self._for_the_page(*self._drawn(width))
 
     def _add(self, kind: str, draw: Callable[[Any, str], None], titles: Sequence[str] = ()) -> None:
         self._marks.append(_Mark(kind, draw, titles))
 
-    def _drawn(self) -> tuple[bytes, dict[str, str]]:
+    def _drawn(self, width: int) -> tuple[bytes, dict[str, str]]:
         """The SVG as matplotlib writes it, and the place of the axes in it."""
         import matplotlib as mpl
         from matplotlib.backends.backend_svg import FigureCanvasSVG
 
         with mpl.rc_context(_settings()):
-            figure = figure_class()(figsize=(WIDTH / 72, HEIGHT / 72), dpi=72)
+            figure = figure_class()(figsize=(width / 72, HEIGHT / 72), dpi=72)
             figure.patch.set_visible(False)
             axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), frameon=False)
             axes.set(xlim=self.x, ylim=self.y[::-1] if self.down else self.y, xlabel=self.labels[0])
             axes.set_ylabel(self.labels[1], rotation_mode="anchor")
             for k, mark in enumerate(self._marks):
                 mark.draw(axes, f"mark {k}")
-            box = self._place(figure, axes)
+            box = self._place(figure, axes, width)
             file = io.BytesIO()
             canvas: Any = FigureCanvasSVG(figure)
             canvas.print_svg(file, metadata=_NO_METADATA)
         return file.getvalue(), box
 
-    def _place(self, figure: Any, axes: Any) -> dict[str, str]:
+    def _place(self, figure: Any, axes: Any, width: int) -> dict[str, str]:
         """Ticks, the key, and room for all labels; the place that is left for the axes, as an SVG's."""
         axes.tick_params(length=0, pad=6)
         axes.locator_params(nbins=_TICKS, steps=(1, 2, 5, 10))
+        if self._counted:
+            last = int(self.x[1])
+            axes.set_xticks(np.arange(1, last + 1, 1 + last // _WHOLE_TICKS))
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_formatter("{x:g}")
         texts = axes.yaxis.get_major_formatter().format_ticks(axes.yaxis.get_majorticklocs())
         left = 28.0 + 8.0 * max(map(len, texts))
         handles, names = axes.get_legend_handles_labels()
         bottom = _BOTTOM + 20 * (len(names) > 0)
-        wide, high = WIDTH - left - _RIGHT, float(HEIGHT - _TOP - bottom)
+        wide, high = width - left - _RIGHT, float(HEIGHT - _TOP - bottom)
         if self.square:
             high = wide * (self.y[1] - self.y[0]) / (self.x[1] - self.x[0])
         height = high + _TOP + bottom
-        figure.set_size_inches(WIDTH / 72, height / 72)
-        axes.set_position((left / WIDTH, bottom / height, wide / WIDTH, high / height))
+        figure.set_size_inches(width / 72, height / 72)
+        axes.set_position((left / width, bottom / height, wide / width, high / height))
         axes.yaxis.set_label_coords((14 - left) / wide, 0.5)
         axes.xaxis.set_label_coords(0.5, -23 / high)
         if names:

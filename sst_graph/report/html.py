@@ -56,10 +56,19 @@ def bullets(lines: Iterable[str]) -> str:
     return f"<ul>{items}</ul>" if items else ""
 
 
-def figure(content: str, title: str, caption: str) -> str:
-    """A chart or picture with its title above and, below, what to look for."""
+def numbered(items: Iterable[str]) -> str:
+    """A list whose numbers are those of a chart's bars."""
+    return '<ol class="numbered">' + "".join(f"<li>{text(item)}</li>" for item in items) + "</ol>"
+
+
+def figure(content: str, title: str, caption: str, *, below: str = "", kind: str = "") -> str:
+    """A chart or picture with its title above and, below, what to look for, and what else belongs to it.
+
+    Of the kinds "wide" and "listed" it is as wide as the page, the latter with a list beside the chart.
+    """
+    opened = f'<figure class="{kind}">' if kind else "<figure>"
     return (
-        f"<figure><h3>{text(title)}</h3>{content}<figcaption>{text(caption)}</figcaption></figure>"
+        f"{opened}<h3>{text(title)}</h3>{content}<figcaption>{text(caption)}</figcaption>{below}</figure>"
         if content
         else ""
     )
@@ -72,11 +81,17 @@ def grid(figures: Sequence[str], kind: str = "") -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
-    """A table; the first cell of a row is its name."""
+    """A table; the first cell of a row is its name.
+
+    Of the kind "stacked" its cells stand below each other on a narrow page, each with its column's head.
+    """
     top = "".join(f'<th scope="col">{text(cell)}</th>' for cell in head)
     body = "".join(
         f'<tr><th scope="row">{text(first)}</th>'
-        + "".join(f"<td>{text(cell)}</td>" for cell in cells)
+        + "".join(
+            (f'<td data-head="{text(name)}">' if kind == "stacked" else "<td>") + f"{text(cell)}</td>"
+            for name, cell in zip(head[1:], cells, strict=True)
+        )
         + "</tr>"
         for first, *cells in rows
     )
@@ -86,6 +101,17 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") ->
     )
 
 
+def lines(rows: Iterable[tuple[str, str]]) -> str:
+    """Lines of a terminal: names, and texts whose spaces count; one without a name continues another."""
+    body = "".join(
+        f'<tr><th scope="row">{text(name)}</th><td>{text(line)}</td></tr>'
+        if line
+        else f'<tr><th scope="row" colspan="2">{text(name)}</th></tr>'
+        for name, line in rows
+    )
+    return f'<table class="lines"><tbody>{body}</tbody></table>'
+
+
 def details(title: str, *blocks: str) -> str:
     """Blocks that are shown on a click."""
     body = "\n".join(block for block in blocks if block)
@@ -93,7 +119,7 @@ def details(title: str, *blocks: str) -> str:
 
 
 def preformatted(words: str) -> str:
-    return f'<div class="scroll"><pre>{text(words)}</pre></div>'
+    return f"<pre>{text(words)}</pre>"
 
 
 def jpeg(picture: NDArray[np.uint8]) -> str:

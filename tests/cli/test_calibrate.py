@@ -54,7 +54,7 @@ def test_from_disk_to_a_calibration(
     code = _calibrate(street, out, "--set", "observability.time_offset_s=0.05")
     captured = capsys.readouterr()
     assert (code, captured.err) == (0, "")
-    assert "against the truth" in captured.out and "deg (QAD)" in captured.out
+    assert "against the truth" in captured.out and "deg (QAD: the whole angle)" in captured.out
     document = _strict_json(out / "calibration.json")
     assert document["config"]["observability"]["time_offset_s"] == 0.05
     assert document["camera"]["name"] == "image_2"

@@ -43,8 +43,8 @@ def result_file(tmp_path: Path, kitti_drive: Path) -> Path:
 def test_evaluate_prints_every_metric(result_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", str(result_file), "--truth", str(result_file.parent / "truth.json")]) == 0
     out = capsys.readouterr().out
-    assert "1.000 deg (QAD)" in out and "0.333 deg (AEAD)" in out
-    assert "1.00 cm (ATD)" in out and "+4.00 ms" in out
+    assert "1.000 deg (QAD: the whole angle), 0.333 deg (AEAD: mean of roll, pitch and yaw)" in out
+    assert "1.00 cm (ATD: mean of x, y and z)" in out and "+4.00 ms" in out
     assert "NEES" in out and "of 7" in out
 
 
