@@ -36,7 +36,7 @@ for (const root of document.querySelectorAll(".overlay")) {
       const boundary = residual !== none;
       if (mode === "residual" ? !boundary : boundary) continue;
       const u = x / 65534 * canvas.width, v = y / 65534 * canvas.height;
-      const size = (mode === "residual" ? 2.6 : 1.7) * Math.sqrt(zoom);
+      const size = (mode === "residual" ? 5.2 : 1.7) * Math.sqrt(zoom);
       pen.fillStyle = mode === "depth" ? depthColour(depths[i])
         : mode === "class" ? (hues[classes[i]] || "#9aa0a6") : residualColour(residual);
       pen.fillRect(u - size / 2, v - size / 2, size, size);
@@ -87,6 +87,7 @@ for (const root of document.querySelectorAll(".overlay")) {
     };
     canvas.addEventListener("pointerdown", drag);
     canvas.addEventListener("pointermove", drag);
+    root.classList.add("divided");
     bar.append("before", slider, "after");
   }
   const modes = document.createElement("fieldset"), legend = document.createElement("legend");

@@ -34,7 +34,7 @@ from sst_graph.report.html import (
     text,
 )
 from sst_graph.report.overlay import Placements, overlay
-from sst_graph.report.residual_charts import residual_charts
+from sst_graph.report.residual_charts import broad_charts, residual_charts
 from sst_graph.report.uncertainty_charts import (
     convergence_chart,
     correlation_table,
@@ -252,7 +252,7 @@ def _named(result: CalibrationResult, fit: Fit, name: str, title: str) -> tuple[
 def _residuals(result: CalibrationResult, fit: Fit) -> str:
     return section(
         *_named(result, fit, "residuals", "Residuals"),
-        grid([*residual_charts(fit, result.camera), convergence_chart(fit, result)]),
+        grid([*residual_charts(fit), convergence_chart(fit, result), *broad_charts(fit, result.camera)]),
     )
 
 

@@ -7,9 +7,9 @@ import numpy as np
 from sst_graph.errors import count_of
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.fit import CLOSE_PX, Fit, PointResiduals
-from sst_graph.report.chart import Chart
-from sst_graph.report.html import figure
-from sst_graph.types import FloatArray, IntArray
+from sst_graph.report.chart import BROAD, Chart
+from sst_graph.report.html import figure, numbered
+from sst_graph.types import FloatArray, IntArray, SemanticClass
 
 _MOST_OBJECTS = 30
 """Objects of the chart: those with the most points."""
@@ -27,14 +27,12 @@ _MOST_PX = 6.0
 """Residuals farther out are drawn at the border [px]."""
 
 
-def residual_charts(fit: Fit, camera: PinholeCamera) -> list[str]:
-    """All of them, as figures."""
+def residual_charts(fit: Fit) -> list[str]:
+    """Those that stand beside each other, as figures."""
     points = fit.points
     return [
         _histogram(fit),
         _by_frame(fit),
-        _by_object(fit),
-        _over_picture(fit, camera),
         _binned(
             points, np.linalg.norm(points.lPs, axis=1), "range [m]", "Over the range", _range_caption(fit)
         ),
@@ -46,6 +44,11 @@ def residual_charts(fit: Fit, camera: PinholeCamera) -> list[str]:
             _AZIMUTH,
         ),
     ]
+
+
+def broad_charts(fit: Fit, camera: PinholeCamera) -> list[str]:
+    """Those that are as wide as the page, as figures."""
+    return [_by_object(fit), _over_picture(fit, camera)]
 
 
 _AZIMUTH = (
@@ -138,13 +141,10 @@ def _by_object(fit: Fit) -> str:
         float(np.average(points.residuals_px[own], weights=points.weights[own] + 1e-9)) for own in groups
     ]
     order = np.argsort(middles)
-    ranges = [float(np.median(np.linalg.norm(points.lPs[own], axis=1))) for own in groups]
-    titles = [
-        f"{middles[k]:+.2f} px, {count_of(len(groups[k]), 'point')}, at {ranges[k]:.0f} m" for k in order
-    ]
+    names = [f"{_name(points.take(groups[k]))}: {middles[k]:+z.2f} px" for k in order]
     most = max(1.0, float(np.abs(middles).max()))
     chart = Chart(
-        (-0.5, len(groups) - 0.5),
+        (0.5, len(groups) + 0.5),
         (-1.1 * most, 1.1 * most),
         (
             "object, by its residual" if fit.by_edges else "object, from drawn too large to drawn too small",
@@ -152,8 +152,9 @@ def _by_object(fit: Fit) -> str:
         ),
         "Mean residual of each object",
     )
+    chart.count_along_x()
     chart.level(0.0)
-    chart.bars(np.arange(len(groups)), np.array(middles)[order], 0.8, "a", titles)
+    chart.bars(np.arange(1, len(groups) + 1), np.array(middles)[order], 0.8, "a", names)
     return figure(
         chart.svg(),
         "By object",
@@ -164,6 +165,21 @@ def _by_object(fit: Fit) -> str:
             if fit.by_edges
             else "Most labels err by less than 1 px; an object far out is drawn badly, or moves."
         ),
+        below=numbered(names),
+        kind="listed",
+    )
+
+
+def _name(points: PointResiduals) -> str:
+    """What an object is, where the LiDAR sees it, and in how many frames."""
+    lP = np.median(points.lPs, axis=0)
+    azimuth = round(float(np.degrees(np.arctan2(lP[1], lP[0]))))
+    side = f"{abs(azimuth)}° {'left' if azimuth > 0 else 'right'}" if azimuth else "ahead"
+    class_name = SemanticClass(int(points.classes[0])).name.lower().replace("_", " ")
+    frames = count_of(len(np.unique(points.frames)), "frame")
+    return (
+        f"{class_name} at {np.median(np.linalg.norm(points.lPs, axis=1)):.0f} m, {side}, "
+        f"{count_of(len(points), 'point')} in {frames}"
     )
 
 
@@ -177,9 +193,10 @@ def _over_picture(fit: Fit, camera: PinholeCamera) -> str:
         .clip(0, [columns - 1, rows - 1])
     )
     numbers = cell[:, 1] * columns + cell[:, 0]
+    least = _LEAST_IN_CELL_BY_EDGES if fit.by_edges else _LEAST_IN_CELL
     places, shifts, titles = [], [], []
     for own in _groups(numbers, columns * rows):
-        if len(own) < (_LEAST_IN_CELL_BY_EDGES if fit.by_edges else _LEAST_IN_CELL):
+        if len(own) < least:
             continue
         n, w = points.normals[own], points.weights[own]
         H = n.T @ (w[:, None] * n)
@@ -187,7 +204,7 @@ def _over_picture(fit: Fit, camera: PinholeCamera) -> str:
         shift = np.linalg.solve(H, n.T @ (w * points.residuals_px[own]))
         places.append(uvs[own].mean(axis=0))
         shifts.append(shift)
-        titles.append(f"{shift[0]:+.2f} px right, {shift[1]:+.2f} px down, {count_of(len(own), 'point')}")
+        titles.append(f"{shift[0]:+z.2f} px right, {shift[1]:+z.2f} px down, {count_of(len(own), 'point')}")
     if not places:
         return ""
     at, by = np.array(places), np.array(shifts)
@@ -202,12 +219,15 @@ def _over_picture(fit: Fit, camera: PinholeCamera) -> str:
         square=True,
     )
     chart.arrows(at[:, 0], at[:, 1], enlarged * by[:, 0], enlarged * by[:, 1], titles)
+    drawn = f'<div class="broad">{chart.svg(BROAD)}</div><div class="narrow">{chart.svg()}</div>'
     return figure(
-        chart.svg(),
+        drawn,
         "Over the picture",
         f"Where the points lie against the {_edge_name(fit)}s, {enlarged:g} times enlarged (longest "
         f"{longest:.2f} px). Short arrows in all directions are good; a common direction, a swirl or a star "
-        "is a calibration or a lens that is wrong.",
+        "is a calibration or a lens that is wrong. Where there is no arrow, there are fewer than "
+        f"{least} points.",
+        kind="wide",
     )
 
 

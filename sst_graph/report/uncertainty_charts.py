@@ -10,6 +10,7 @@ import numpy as np
 from sst_graph.fit import Fit, Profile
 from sst_graph.inspect.gained_text import SHORT
 from sst_graph.inspect.inspection import HUMAN, NAMES, UNITS, Correlation, correlation_matrix, sigma_ellipse
+from sst_graph.inspect.reasons import capitalized
 from sst_graph.report.chart import Chart
 from sst_graph.report.html import figure, table, text
 from sst_graph.result import CalibrationResult
@@ -17,6 +18,8 @@ from sst_graph.result import CalibrationResult
 _LEAST_SIGMAS = 1e-3
 """Distances below are drawn at it: they are nothing beside the uncertainty."""
 _ELLIPSES = 3
+_HARDLY_SEPARATE = 0.8
+"""Correlation above which an ellipse's caption says what it means."""
 
 
 def convergence_chart(fit: Fit, result: CalibrationResult) -> str:
@@ -81,7 +84,7 @@ def _profile(profile: Profile, sigma: float) -> str:
     roots = np.interp(x, profile.steps, np.sign(profile.steps - best) * np.sqrt(tempered))
     chart.line(scale * x, np.exp(-(roots**2)), "a", "profile")
     chart.dots(scale * profile.steps, np.exp(-tempered), "a")
-    title = NAMES[profile.unknown][0].upper() + NAMES[profile.unknown][1:]
+    title = capitalized(_full_name(profile.unknown))
     caption = f"One sigma of the result: {scale * sigma:.2g} {unit}."
     if profile.best_score is not None:
         low, high = (100.0 * profile.costs[[0, -1]] / max(profile.best_score, 1e-9)).tolist()
@@ -97,18 +100,28 @@ def ellipse_charts(result: CalibrationResult, pairs: Sequence[Correlation]) -> l
         i, j = pair.first, pair.second
         ellipse = sigma_ellipse(covariance[np.ix_((i, j), (i, j))], 91)
         reach = 2.2 * np.sqrt(covariance[[i, j], [i, j]])
+        first, second = _full_name(i), _full_name(j)
         chart = Chart(
             (-reach[0], reach[0]),
             (-reach[1], reach[1]),
-            (f"{NAMES[i]} [{UNITS[i]}]", f"{NAMES[j]} [{UNITS[j]}]"),
-            f"Ellipses of {NAMES[i]} and {NAMES[j]}, correlation {pair.value:+.2f}",
+            (f"{first} [{UNITS[i]}]", f"{second} [{UNITS[j]}]"),
+            f"Ellipses of {first} and {second}, correlation {pair.value:+z.2f}",
         )
         chart.line(2.0 * ellipse[0], 2.0 * ellipse[1], "a", "2 sigma", dashed=True)
         chart.line(ellipse[0], ellipse[1], "a", "1 sigma")
         chart.dots([0.0], [0.0], "a")
-        caption = f"Correlation {pair.value:+.2f}: in a narrow slanted ellipse the two hardly separate."
-        found.append(figure(chart.svg(), f"{SHORT[i]} against {SHORT[j]}", caption))
+        caption = f"Correlation {pair.value:+z.2f}" + (
+            ": the ellipse is narrow and slanted, so the data hardly tell the two apart."
+            if abs(pair.value) > _HARDLY_SEPARATE
+            else "."
+        )
+        found.append(figure(chart.svg(), capitalized(f"{first} against {second}"), caption))
     return found
+
+
+def _full_name(unknown: int) -> str:
+    """Name of an unknown where no axis says that x, y and z are translations."""
+    return f"translation {NAMES[unknown]}" if 3 <= unknown < 6 else NAMES[unknown]
 
 
 def correlation_table(result: CalibrationResult) -> str:
@@ -116,9 +129,9 @@ def correlation_table(result: CalibrationResult) -> str:
     values = correlation_matrix(result.covariance)
     plain = table(
         ("", *SHORT),
-        [(name, *(f"{value:+.2f}" for value in row)) for name, row in zip(SHORT, values, strict=True)],
+        [(name, *(f"{value:+z.2f}" for value in row)) for name, row in zip(SHORT, values, strict=True)],
         "numbers",
     )
-    for strong in {f"{value:+.2f}" for value in values.flat if 0.6 <= abs(value) < 1.0}:
+    for strong in {f"{value:+z.2f}" for value in values.flat if 0.6 <= abs(value) < 1.0}:
         plain = plain.replace(f"<td>{text(strong)}</td>", f'<td class="strong">{text(strong)}</td>')
     return plain
