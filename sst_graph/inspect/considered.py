@@ -34,3 +34,16 @@ def considered_errors(result: CalibrationResult) -> dict[str, tuple[float, Float
         if len(numbers) == 8 and all(map(is_number, numbers)):
             found[name] = float(numbers[0]), np.array(numbers[1:], np.float64)
     return found
+
+
+def covered_errors(result: CalibrationResult) -> dict[str, float]:
+    """Estimate of each parameter that is off while its step is in the covariance, by name, in its unit.
+
+    By edges a lens that the data contradict is a reason against the result only where the estimate moves
+    farther than it is known with the lens free; else that step is added to the covariance.
+    """
+    if result.method != "edges" or result.status == "not_converged":
+        return {}
+    entries = stored_assumptions(result).items()
+    off = {name: entry.get("estimate") for name, entry in entries if entry.get("contradicted") is True}
+    return {name: float(value) for name, value in off.items() if is_number(value)}

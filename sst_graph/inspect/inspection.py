@@ -18,7 +18,7 @@ from sst_graph.factors.arguments import described, is_whole
 from sst_graph.files.strict_json import json_able
 from sst_graph.inspect.frame_information import KEY, FrameInformation, frames_of
 from sst_graph.inspect.gained import Gained, gained_of
-from sst_graph.inspect.pixels import pixel_covariance
+from sst_graph.inspect.misfit import DEPTHS_M, misfit_at
 from sst_graph.inspect.planning import Plan, limits_of, plan_recording
 from sst_graph.result import CalibrationResult, Sigmas, WeakDirection
 from sst_graph.types import ByValue, FloatArray
@@ -27,10 +27,6 @@ NAMES = ("rotation x", "rotation y", "rotation z", "x", "y", "z", "time offset")
 UNITS = ("deg", "deg", "deg", "cm", "cm", "cm", "ms")
 HUMAN: FloatArray = np.array([180.0 / np.pi] * 3 + [100.0] * 3 + [1000.0])
 """(7,) from SI to :data:`UNITS`."""
-
-RANGES_M = (5.0, 20.0, 50.0)
-"""Ranges for which the error in the image is given [m]."""
-
 
 STRONG = 0.6
 """Least correlation that is put into words: above it, knowing one unknown takes a fifth or more off the
@@ -64,16 +60,20 @@ class Correlation:
 
 @dataclass(frozen=True)
 class PixelSigma:
-    """Error in the image of a point straight ahead, one sigma, everything at rest.
+    """Error in the image, one sigma, everything at rest.
 
     Attributes:
-        range_m: its depth [m].
-        across_px, down_px: along the image's x and y [px].
+        range_m: depth of the point [m].
+        across_px, down_px: straight ahead, by the calibration alone, along the image's x and y [px].
+        corner_px: at the worst place of the image, the lens counted [px].
+        lens_counts: whether the lens makes the last one clearly larger than the calibration alone does.
     """
 
     range_m: float
     across_px: float
     down_px: float
+    corner_px: float
+    lens_counts: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +131,7 @@ def inspect_result(result: CalibrationResult, next_frames: int = 10) -> Inspecti
         result,
         result.sigmas(),
         camera_sigmas(result),
-        tuple(pixel_sigma(result, range_m) for range_m in RANGES_M),
+        tuple(pixel_sigma(result, range_m) for range_m in DEPTHS_M),
         correlation_matrix(result.covariance),
         strong_correlations(result.covariance, STRONG),
         weakest_direction(result, limits),
@@ -199,10 +199,9 @@ def camera_sigmas(result: CalibrationResult) -> Sigmas:
 
 
 def pixel_sigma(result: CalibrationResult, range_m: float) -> PixelSigma:
-    """How far a point on the optical axis is drawn from where the picture shows it, to one sigma, at rest."""
-    covariance = pixel_covariance(result, np.array([0.0, 0.0, range_m]), np.eye(6, 7))
-    across, down = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
-    return PixelSigma(range_m, across, down)
+    """How far a point may be drawn from where the picture shows it, straight ahead and in the corners."""
+    one = misfit_at(result, range_m)
+    return PixelSigma(range_m, one.across_px, one.down_px, one.corner_px, one.lens_counts)
 
 
 def weakest_direction(result: CalibrationResult, limits: ObservabilityConfig) -> WeakDirection:

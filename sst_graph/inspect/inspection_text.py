@@ -21,7 +21,7 @@ from sst_graph.inspect.inspection import (
     telling_frames,
 )
 from sst_graph.inspect.planning import MOST_FRAMES as MOST_RECORDED
-from sst_graph.inspect.planning import Plan, Prediction
+from sst_graph.inspect.planning import Plan, Prediction, View
 from sst_graph.inspect.planning import limits_of as limits_of_result
 from sst_graph.inspect.verdict import fit_line
 from sst_graph.result import CalibrationResult
@@ -59,6 +59,11 @@ def correlation_sentence(pair: Correlation) -> str:
     )
 
 
+def weakest_ratio(inspection: Inspection) -> float:
+    """Largest sigma over its limit: up to 1 no direction is past it."""
+    return worst_ratio(inspection.result.covariance, limits_of_result(inspection.result))
+
+
 def frame_list(frames: Sequence[FrameInformation], positions: Sequence[int]) -> str:
     """Frames by number, runs of neighbours (of one drive) shortened: "0, 4-7", "a/00: 0, 4-7; b/00: 3"."""
     runs: list[list[int]] = []
@@ -78,40 +83,56 @@ def frame_list(frames: Sequence[FrameInformation], positions: Sequence[int]) -> 
 
 
 def advice_sentences(inspection: Inspection, plan: Plan) -> list[str]:
-    """What to record next, most useful first; every number is computed from the record."""
+    """What to record next, most useful first; every number is computed from the record.
+
+    Figures that are the same after rounding are left out, and with them a sentence that has no other.
+    """
     best, now = plan.best, plan.now
     axes = np.argsort(-np.abs(inspection.weakest.vector))[:2]
+    changes = _changes(now, best, axes)
     sentences = [
         f"record {count_of(plan.count, 'frame')} {best.name}, each at another place: "
-        f"{_changes(now, best, axes)}; " + _status_after(best, plan.count, now)
+        + "; ".join(part for part in (changes, _status_after(best, plan.count, now)) if part)
     ]
-    sentences.append(f"the same with objects half as far: {_changes(best, plan.nearer, axes)}")
+    if changes := _changes(best, plan.nearer, axes):
+        sentences.append(f"the same with objects half as far: {changes}")
     views = plan.views
     if len(views) > 1:
-        first, last = views[0], views[-1]
-        sentences.append(
-            f"views count: {plan.count} like frame {_frame_name(inspection, first.position)} "
-            f"({_scene(inspection.frames[first.position])}) give {_values(first.prediction, axes)}, "
-            f"like frame {_frame_name(inspection, last.position)} "
-            f"({_scene(inspection.frames[last.position])}) {_values(last.prediction, axes)}"
-        )
+        if (sentence := _by_view(inspection, plan, axes)) is not None:
+            sentences.append(sentence)
         if (sentence := _elsewhere(inspection, plan)) is not None:
             sentences.append(sentence)
     return sentences
+
+
+def _by_view(inspection: Inspection, plan: Plan, axes: NDArray[np.intp]) -> str | None:
+    """A sentence about the best and the worst view, where they differ."""
+    first, last = plan.views[0], plan.views[-1]
+    differ = _differing(first.prediction, last.prediction, axes)
+    if not len(differ):
+        return None
+
+    def frames_like(view: View) -> str:
+        scene = _scene(inspection.frames[view.position])
+        return f"{plan.count} like frame {_frame_name(inspection, view.position)} ({scene})"
+
+    return (
+        f"it matters what is in view: {frames_like(first)} would give {_values(first.prediction, differ)}, "
+        f"but {frames_like(last)} {_values(last.prediction, differ)}"
+    )
 
 
 def _elsewhere(inspection: Inspection, plan: Plan) -> str | None:
     """A sentence about errors that frames share, where they dominate."""
     lost = plan.now.sigmas / plan.elsewhere.sigmas
     axes = np.argsort(-lost)[:2]
-    if lost[axes[0]] < 1.2:
+    differ = _differing(plan.elsewhere, plan.now, axes)
+    if lost[axes[0]] < 1.2 or not len(differ):
         return None
     return (
-        "other places beat more frames of this one: the same "
-        f"{count_of(len(inspection.frames), 'frame')}, each at "
-        f"another place, would have given {_values(plan.elsewhere, axes)} instead of "
-        f"{_values(plan.now, axes)}; "
-        "the outlines of the same objects err again and again"
+        "record at other places: the outline of one object errs in the same way in every frame that shows "
+        f"it; these {count_of(len(inspection.frames), 'frame')}, each taken at another place, would have "
+        f"given {_values(plan.elsewhere, differ)} instead of {_values(plan.now, differ)}"
     )
 
 
@@ -146,11 +167,13 @@ def _sigma_block(inspection: Inspection) -> list[str]:
     lines += [f"{name:<36}{unit:>4}" + "".join(f"{short(v):>9}" for v in xyz) for name, unit, xyz in rows]
     lines.append(f"{'time offset':<36}{'ms':>4}{short(lidar.time_offset_ms):>9}")
     lines.append("camera axes: x right (turning about it: pitch), y down (yaw), z forward (roll)")
-    pixels = ", ".join(
-        f"{pixel.range_m:.0f} m: {short(pixel.across_px)} x {short(pixel.down_px)} px"
-        for pixel in inspection.pixels
-    )
-    lines.append(f"in the image, across x down, at rest, for a point straight ahead at {pixels}")
+    depths = ", ".join(f"{pixel.range_m:.0f}" for pixel in inspection.pixels)
+    ahead = ", ".join(f"{short(pixel.across_px)} x {short(pixel.down_px)}" for pixel in inspection.pixels)
+    corners = ", ".join(short(pixel.corner_px) for pixel in inspection.pixels)
+    lens = ", where the lens counts" if any(pixel.lens_counts for pixel in inspection.pixels) else ""
+    lines.append(f"in the image, at rest, at a depth of {depths} m:")
+    lines.append(f"{'  straight ahead, across x down':<40}{ahead} px")
+    lines.append(f"{f'  in the corners{lens}':<40}{corners} px")
     return lines
 
 
@@ -169,7 +192,7 @@ def _correlation_block(inspection: Inspection) -> list[str]:
 
 def _weak_block(inspection: Inspection) -> list[str]:
     result = inspection.result
-    ratio = worst_ratio(result.covariance, limits_of_result(result))
+    ratio = weakest_ratio(inspection)
     if result.weak_directions:
         lines = ["weak directions (past the limits), the weakest first"]
         return lines + [f"- {weak.sentence}: {weak.advice}" for weak in result.weak_directions]
@@ -261,9 +284,16 @@ def _such(count: int) -> str:
     return count_of(count, "such frame")
 
 
+def _differing(one: Prediction, other: Prediction, axes: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Those of the unknowns whose sigmas are not the same after rounding."""
+    a, b = _sigmas(one.sigmas), _sigmas(other.sigmas)
+    return np.array([i for i in axes if short(a[i]) != short(b[i])], np.intp)
+
+
 def _changes(before: Prediction, after: Prediction, axes: NDArray[np.intp]) -> str:
     a, b = _sigmas(before.sigmas), _sigmas(after.sigmas)
-    return ", ".join(f"{NAMES[i]} {short(a[i])} -> {short(b[i])} {UNITS[i]}" for i in axes)
+    differ = _differing(before, after, axes)
+    return ", ".join(f"{NAMES[i]} {short(a[i])} -> {short(b[i])} {UNITS[i]}" for i in differ)
 
 
 def _values(prediction: Prediction, axes: NDArray[np.intp]) -> str:

@@ -3,50 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
 from sst_graph.errors import count_of
-from sst_graph.factors.camera import PinholeCamera
 from sst_graph.fit import CLOSE_PX, EDGES_QUALITY, FitQuality
-from sst_graph.inspect.pixels import cP_H_cTl, pixel_covariance
+from sst_graph.inspect.misfit import MIDDLE_M, misfit_at
 from sst_graph.inspect.reasons import as_sentence, short_reasons
 from sst_graph.result import CalibrationResult
-from sst_graph.types import FloatArray
-
-REACHES_M = (10.0, 30.0, 60.0)
-"""Depths for which the error in the picture is given [m]."""
-_PLACES = 3
-"""Places across and down the picture, its borders among them, at which the error is evaluated."""
-DRIVING_MPS = 10.0
-"""Speed, straight ahead, for which the error is given besides that at rest [m/s]."""
 
 CHECK_BY_EDGES = "a check by edges of the pictures, which the estimate has not used"
-
-
-@dataclass(frozen=True)
-class Misfit:
-    """How far the cloud may sit from the picture: one standard deviation, worst direction, worst place in the
-    picture.
-
-    Attributes:
-        depth_m: depth of the point [m].
-        pixels: in the picture (:func:`~sst_graph.inspect.pixels.pixel_covariance`) [px].
-        cm: across the line of sight [cm].
-        driving_pixels: in the picture at :data:`DRIVING_MPS`, where the time offset counts too [px].
-    """
-
-    depth_m: float
-    pixels: float
-    cm: float
-    driving_pixels: float
-
-
-def misfits(result: CalibrationResult) -> tuple[Misfit, ...]:
-    """At each of :data:`REACHES_M`, by the result's covariance."""
-    return tuple(_misfit(result, depth_m) for depth_m in REACHES_M)
 
 
 def largest_sigmas(result: CalibrationResult) -> tuple[float, float, float]:
@@ -129,45 +96,14 @@ def edges_line(result: CalibrationResult) -> str:
 
 def _known(result: CalibrationResult) -> str:
     degrees, cm, ms = largest_sigmas(result)
-    middle = misfits(result)[1]
+    one = misfit_at(result, MIDDLE_M)
+    lens = "where the lens counts, " if one.lens_counts else ""
+    corners = f"; in the corners, {lens}{figure(one.corner_px)} px" if one.more_in_corners else ""
     return (
-        f"{figure(degrees)}° and {figure(cm)} cm: at {middle.depth_m:.0f} m the cloud sits within "
-        f"{figure(middle.pixels)} pixels of the picture. The time offset is known to {figure(ms)} ms."
+        f"{figure(degrees)}° and {figure(cm)} cm (one sigma): at {one.depth_m:.0f} m the cloud may be "
+        f"{figure(one.pixels)} px off in the middle of the picture{corners}. "
+        f"The time offset is known to {figure(ms)} ms."
     )
-
-
-def _misfit(result: CalibrationResult, depth_m: float) -> Misfit:
-    forward = result.T_camera_lidar.rotation().unrotate(np.array([0.0, 0.0, DRIVING_MPS]))
-    resting, driving = np.eye(6, 7), np.eye(6, 7)
-    driving[3:, 6] = -forward
-    found = []
-    for cP in _places(result.camera, depth_m):
-        sight = np.eye(3) - np.outer(cP, cP) / float(cP @ cP)
-        across = sight @ cP_H_cTl(result.T_camera_lidar, cP)
-        found.append(
-            (
-                _worst(pixel_covariance(result, cP, resting)),
-                100.0 * _worst(across @ result.covariance[:6, :6] @ across.T),
-                _worst(pixel_covariance(result, cP, driving)),
-            )
-        )
-    pixels, cm, driving_pixels = np.max(found, axis=0).tolist()
-    return Misfit(depth_m, pixels, cm, driving_pixels)
-
-
-def _places(camera: PinholeCamera, depth_m: float) -> list[FloatArray]:
-    """Points (3,) at a depth that are seen all over the picture [m]."""
-    us, vs = (np.linspace(0.0, size - 1.0, _PLACES) for size in (camera.width, camera.height))
-    return [
-        depth_m * np.array([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0])
-        for u in us
-        for v in vs
-    ]
-
-
-def _worst(covariance: FloatArray) -> float:
-    """Largest standard deviation in any direction."""
-    return float(np.sqrt(max(0.0, np.linalg.eigvalsh(covariance)[-1])))
 
 
 def figure(value: float) -> str:

@@ -15,6 +15,7 @@ from sst_graph.factors import residuals
 from sst_graph.factors.matches import Alignment
 from sst_graph.features.mask_contour import ContourMap
 from sst_graph.fit import CLOSE_PX, Fit, PointResiduals
+from sst_graph.inspect.pixels import covariance_of_given_lens, drawn_covariance
 from sst_graph.report.drawn_frame import DrawnFrame, DriveReader
 from sst_graph.report.html import jpeg, text
 from sst_graph.report.overlay import Placements, project_points
@@ -45,6 +46,8 @@ _WHITE, _MOST_GAIN = 230.0, 3.0
 """Grey level of what is bright, and most that contrast is raised: more would show noise."""
 _EDGE_PX = 0.8
 """Half the length at which an edge of the picture is drawn [px]."""
+_LENS_COUNTS = 1.2
+"""The caption names what the lens adds where the move is then so many times as large."""
 _SIDE_NAMES = ("left", "right", "top", "bottom")
 
 
@@ -156,7 +159,8 @@ def _close_up(
     result: CalibrationResult,
 ) -> str:
     uvs, _ = project_points(drawn, points, placements.after)
-    moves = _two_sigma_moves(drawn, points, placements, result)
+    A = _uv_H_unknowns(drawn, points, placements)
+    moves = _two_sigma_moves(A, covariance_of_given_lens(result))
     crop = _Crop.around(uvs, _leverages(points, result.covariance), drawn.image.pixels)
     picture = crop.enlarged(drawn.image.pixels)
     class_name = SemanticClass(int(points.classes[0])).name.lower().replace("_", " ")
@@ -173,7 +177,7 @@ def _close_up(
     if result.fit_is_check:
         information = ""
     sides = ", ".join(
-        f"{_SIDE_NAMES[side]} {_mean(points, points.sides == side):+.1f} px"
+        f"{_SIDE_NAMES[side]} {_mean(points, points.sides == side):+z.1f} px"
         for side in np.unique(points.sides)
     )
     column, row = (0.5 * np.array([crop.left + crop.right, crop.top + crop.bottom])).astype(int)
@@ -181,7 +185,7 @@ def _close_up(
         f"{size:.1f} px from the {'edges' if by_edges else 'contour'} (median of "
         f"{count_of(len(r), 'point')}; {sides}), "
         f"{100.0 * np.mean(np.abs(r) < CLOSE_PX):.0f} % within {CLOSE_PX:g} px. ±2 sigma of the calibration "
-        f"moves it by ±{reach:.1f} px. {information}"
+        f"moves it by ±{reach:.1f} px{_by_lens(A, points, uvs, result, reach)}. {information}"
         f"{drawn.frame.drive}, image {drawn.frame.image}, about column {column}, row {row}."
     )
     width, height = picture.shape[1], picture.shape[0]
@@ -195,7 +199,7 @@ def _close_up(
         marks.append(f'<path class="residual" d="M{u:.1f} {v:.1f}L{x:.1f} {y:.1f}"/>')
         marks.append(
             f'<circle class="point {colour}" cx="{u:.1f}" cy="{v:.1f}" r="3">'
-            f"<title>{value:+.1f} px</title></circle>"
+            f"<title>{value:+z.1f} px</title></circle>"
         )
     return (
         f'<figure><h3>{text(title)}</h3><svg class="closeup" viewBox="0 0 {width} {height}" role="img" '
@@ -215,10 +219,8 @@ def _mean(points: PointResiduals, chosen: NDArray[np.bool_]) -> float:
     return float(np.average(points.residuals_px[chosen], weights=points.weights[chosen] + 1e-9))
 
 
-def _two_sigma_moves(
-    drawn: DrawnFrame, points: PointResiduals, placements: Placements, result: CalibrationResult
-) -> FloatArray:
-    """(n, 2) how two sigma of the calibration move each point, along what moves the object most [px]."""
+def _uv_H_unknowns(drawn: DrawnFrame, points: PointResiduals, placements: Placements) -> FloatArray:
+    """(n, 2, 7) derivative of the pixels by extrinsic and time offset."""
     cTl, time_offset_s = placements.after
     alignment = Alignment(
         drawn.camera,
@@ -230,12 +232,40 @@ def _two_sigma_moves(
         l_velocities=points.l_velocities,
     )
     _, J = residuals(alignment, cTl, time_offset_s, drawn.frame.c_twist)
-    A = np.stack([J[: len(points), :7], J[len(points) :, :7]], axis=1)
-    values, vectors = np.linalg.eigh(result.covariance)
+    return np.stack([J[: len(points), :7], J[len(points) :, :7]], axis=1)
+
+
+def _two_sigma_moves(A: FloatArray, covariance: FloatArray) -> FloatArray:
+    """(n, 2) how two sigma of a calibration with a covariance (7, 7) move each point, along what moves the
+    object most [px].
+
+    Args:
+        A: (n, 2, 7) derivative of the pixels by extrinsic and time offset.
+    """
+    values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     reaches = A.reshape(-1, 7) @ root
     _, directions = np.linalg.eigh(reaches.T @ reaches)
     return np.asarray(2.0 * A @ (root @ directions[:, -1]))
+
+
+def _by_lens(
+    A: FloatArray, points: PointResiduals, uvs: FloatArray, result: CalibrationResult, reach_px: float
+) -> str:
+    """What the lens adds to two sigma, in words; empty where it adds little.
+
+    Args:
+        A: (n, 2, 7) derivative of the pixels (n, 2) by extrinsic and time offset.
+        reach_px: two sigma of the calibration with the lens that is given [px].
+    """
+    largest = [
+        float(np.linalg.eigvalsh(drawn_covariance(result, lP, uv, J))[-1])
+        for lP, uv, J in zip(points.lPs, uvs, A, strict=True)
+    ]
+    both_px = 2.0 * float(np.sqrt(max(0.0, np.median(largest))))
+    if both_px < _LENS_COUNTS * reach_px:
+        return ""
+    return f", or by ±{both_px:.1f} px where the lens is off, too, as far as is assumed"
 
 
 def _shown(uvs: FloatArray, importance: FloatArray) -> NDArray[np.bool_]:

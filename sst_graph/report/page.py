@@ -12,19 +12,26 @@ import numpy as np
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.files.strict_json import json_able
 from sst_graph.fit import CLOSE_PX, Fit, MatchedFrame
-from sst_graph.inspect.budget_text import budget_lines
-from sst_graph.inspect.considered import stored_assumptions
+from sst_graph.inspect.budget_text import budget_rows
+from sst_graph.inspect.considered import covered_errors, stored_assumptions
 from sst_graph.inspect.inspection import Inspection, inspect_result, strong_correlations
-from sst_graph.inspect.inspection_text import MOST_SENTENCES, advice_sentences, correlation_sentence
+from sst_graph.inspect.inspection_text import (
+    MOST_SENTENCES,
+    advice_sentences,
+    correlation_sentence,
+    weakest_ratio,
+)
+from sst_graph.inspect.misfit import DRIVING_MPS, misfits
 from sst_graph.inspect.reasons import as_sentence, capitalized, short_reasons
-from sst_graph.inspect.report import Comparison, error_lines, summary
-from sst_graph.inspect.verdict import DRIVING_MPS, figure, fit_line, is_start, misfits, verdict
+from sst_graph.inspect.report import Comparison, error_lines, summary_rows
+from sst_graph.inspect.verdict import figure, fit_line, is_start, verdict
 from sst_graph.report.close_ups import ZOOM, close_ups
 from sst_graph.report.drawn_frame import DrawnFrame, DriveReader
 from sst_graph.report.html import (
     bullets,
     details,
     grid,
+    lines,
     packaged,
     page,
     paragraph,
@@ -49,7 +56,8 @@ _CONTOURS_HINT = (
     f"the part that determines most, {ZOOM} times enlarged. Yellow: contour of the labels, moved to the "
     f"edges of the picture. Points: where the LiDAR sees the object end, green within {CLOSE_PX:g} px of the "
     "contour, red beyond; magenta joins each with its contour. Blue bars: how far ±2 sigma of the "
-    "calibration would move the point. Most points should lie on the yellow line."
+    "calibration would move the point, with the lens that is given. Most points should lie on the yellow "
+    "line."
 )
 _EDGES_USED = (
     "The objects that determine the calibration most, then those whose edges agree with it least; of each "
@@ -63,15 +71,20 @@ _EDGES_NOT_USED = (
 _EDGES_HINT = (
     " Points: where the LiDAR sees the object end, "
     f"green within {CLOSE_PX:g} px of the picture's strongest edge across it, red beyond. Yellow: that edge; "
-    "magenta joins the two. Blue bars: how far ±2 sigma of the calibration would move the point. Trust your "
-    "eyes more than the colours: points must run along the outline that you see. Some have a stronger edge "
-    "beside them, such as a shadow or a marking, and are red under a right calibration too. A row of points "
-    "beside its outline, to the same side in several pictures, is a wrong one."
+    "magenta joins the two. Blue bars: how far ±2 sigma of the calibration would move the point, with the "
+    "lens that is given. Trust your eyes more than the colours: points must run along the outline that you "
+    "see. Some have a stronger edge beside them, such as a shadow or a marking, and are red under a right "
+    "calibration too. A row of points beside its outline, to the same side in several pictures, is a wrong "
+    "one."
 )
 _CHECK = (
     "Under a right calibration the share is 1.3 to 2 times that at random rotations. It judges all of the "
     "result: a few centimetres or a roll that motion leaves open take it down to chance. Where it is lower "
     "than at the start, the start is the better calibration."
+)
+_DRAG = (
+    "Drag in the picture or move the slider: left of the line the cloud as the start would place it, "
+    "right of it as the result does."
 )
 PICTURES = 3
 """Pictures with the cloud, over all drives."""
@@ -123,39 +136,46 @@ def report_html(inputs: ReportInputs) -> str:
 def _verdict(inputs: ReportInputs) -> str:
     result, of_start = inputs.result, is_start(inputs.result)
     fit = fit_line(result)
+    return section(
+        "verdict",
+        "Verdict",
+        f'<p class="verdict {result.status}">{text(verdict(result))}</p>',
+        paragraph(capitalized(fit) + ".") if fit else "",
+        paragraph(_CHECK) if fit and result.fit_is_check else "",
+        "" if of_start or result.status == "not_converged" else _accuracy(result),
+        paragraph(f"Errors {'of the start ' * of_start}against {inputs.comparison.name}:")
+        if inputs.comparison
+        else "",
+        bullets(error_lines(inputs.comparison.errors)) if inputs.comparison else "",
+    )
+
+
+def _accuracy(result: CalibrationResult) -> str:
+    """How far off the calibration may be at each depth, and what the figures mean."""
+    found = misfits(result)
     rows = [
         (
             f"{one.depth_m:.0f} m",
             f"{figure(one.pixels)} px",
             f"{figure(one.cm)} cm",
-            f"{figure(one.driving_pixels)} px",
+            f"{figure(one.corner_px)} px",
+            f"{figure(one.corner_driving_px)} px",
         )
-        for one in misfits(result)
+        for one in found
     ]
     head = (
         "depth",
-        "in the picture",
-        "across the line of sight",
-        f"in the picture, driving at {DRIVING_MPS:g} m/s",
+        "middle of the picture",
+        "the same across the line of sight",
+        "corners",
+        f"corners, driving at {DRIVING_MPS:g} m/s",
     )
-    return section(
-        "verdict",
-        "Verdict",
-        f'<p class="verdict {result.status}">{text(verdict(result))}</p>',
-        paragraph(
-            "All figures are one standard deviation, of the worst axis or direction and at the worst place "
-            "in the picture. About 19 times in 20 the error is below twice as much.",
-            "note",
-        )
-        if not of_start
-        else "",
-        paragraph(capitalized(fit) + ".") if fit else "",
-        paragraph(_CHECK) if fit and result.fit_is_check else "",
-        "" if of_start else table(head, rows, "numbers"),
-        paragraph(f"Errors {'of the start ' * of_start}against {inputs.comparison.name}:")
-        if inputs.comparison
-        else "",
-        bullets(error_lines(inputs.comparison.errors)) if inputs.comparison else "",
+    return table(head, rows, "numbers") + paragraph(
+        "All figures are one standard deviation of the worst axis or direction: about 19 times in 20 the "
+        "error is below twice as much. In the middle: of the calibration alone; an overlay shows less where "
+        "a principal point that is off moves picture and cloud alike. In the corners: with the lens as far "
+        "off as it may be, and while driving with the time offset.",
+        "note",
     )
 
 
@@ -166,14 +186,17 @@ def _next(inspection: Inspection) -> str:
         for one in result.weak_directions
         if not any(one.sentence in reason for reason in result.reasons)
     ]
-    nothing = f"No direction is past its limit. The weakest: {inspection.weakest.sentence}."
     short = [as_sentence(capitalized(reason)) for reason in short_reasons(result)]
-    advice = [] if inspection.plan is None else advice_sentences(inspection, inspection.plan)
+    trusted = result.status != "not_converged"
+    named = any(inspection.weakest.sentence in reason for reason in [*result.reasons, *weak])
+    plan = inspection.plan if trusted else None
+    advice = [] if plan is None else advice_sentences(inspection, plan)
     return section(
         "next",
         "What is weak, and what to record next",
-        bullets(short) if short else paragraph(nothing),
+        bullets(short),
         details("The reasons in full", bullets([*result.reasons, *weak])) if result.reasons else "",
+        paragraph(_weakest(inspection)) if trusted and not is_start(result) and not named else "",
         paragraph(
             "What to record next, by the information that the frames of this record gave "
             "(standard deviations, now -> then):"
@@ -181,7 +204,19 @@ def _next(inspection: Inspection) -> str:
         if advice
         else "",
         bullets(capitalized(one) + "." for one in advice),
+        paragraph("What to record next is predicted only from a result that can be trusted.", "note")
+        if not trusted
+        else "",
     )
+
+
+def _weakest(inspection: Inspection) -> str:
+    """A sentence about the direction that is known worst."""
+    ratio = weakest_ratio(inspection)
+    past, of = (
+        ("No direction is past its limit. The weakest", " of") if ratio <= 1.0 else ("The weakest", " times")
+    )
+    return f"{past}, at {figure(ratio)}{of} its limit: {inspection.weakest.sentence}."
 
 
 def _pictures(inputs: ReportInputs, reader: DriveReader) -> str:
@@ -194,10 +229,9 @@ def _pictures(inputs: ReportInputs, reader: DriveReader) -> str:
             points = fit.points.take(_points_of(fit, one.frame))
             edge_name = "edge of the picture" if fit.by_edges else "contour"
             pictures.append(overlay(one, _placements(result, one.frame.drive), points, edge_name))
-    hint = (
-        "Drag in the picture or move the slider: left of the line the cloud as the start would place it, "
-        "right of it as the result does. Edges of vehicles, poles and kerbs must meet their picture."
-    )
+    with_start = result.initial is not None
+    hint = _DRAG if with_start else "The cloud as the result places it: it began without a start."
+    hint += " Edges of vehicles, poles and kerbs must meet their picture."
     if fits:
         names = (
             "strongest edge nearby" if fit.by_edges else "contour of the labels (yellow)" for fit in fits
@@ -207,7 +241,8 @@ def _pictures(inputs: ReportInputs, reader: DriveReader) -> str:
             " Coloured by residual, only boundary points are shown: green ones lie within "
             f"{CLOSE_PX:g} px of the {compared_with}."
         )
-    return section("pictures", "Before and after", paragraph(hint), *pictures) if pictures else ""
+    title = "Before and after" if with_start else "The cloud in the pictures"
+    return section("pictures", title, paragraph(hint), *pictures) if pictures else ""
 
 
 def _drawn(fit: Fit, reader: DriveReader, most: int) -> list[DrawnFrame]:
@@ -287,11 +322,9 @@ def _background(inputs: ReportInputs, inspection: Inspection) -> str:
     return section(
         "background",
         "Numbers and background",
-        preformatted(summary(result, inputs.comparison)),
+        lines(summary_rows(result, inputs.comparison)),
         _assumptions(result),
-        "<h3>Where the sigmas come from</h3>" + preformatted("\n".join(budget_lines(result)))
-        if budget_lines(result)
-        else "",
+        _budget(result),
         "<h3>Correlations (about and along the LiDAR's axes)</h3>",
         correlation_table(result),
         bullets(sentences),
@@ -304,22 +337,38 @@ def _background(inputs: ReportInputs, inspection: Inspection) -> str:
     )
 
 
+def _budget(result: CalibrationResult) -> str:
+    """A row a part of the covariance."""
+    rows = budget_rows(result)
+    head = ("the largest of each", "rotation", "translation", "time offset")
+    return "<h3>Where the sigmas come from</h3>" + table(head, rows, "numbers") if rows else ""
+
+
 def _assumptions(result: CalibrationResult) -> str:
     """A row an assumption: what the data say of its parameter, and the verdict."""
-    stored = stored_assumptions(result).items()
-    rows = [_assumption_row(name, entry) for name, entry in stored if name in ASSUMPTIONS]
+    stored, covered = stored_assumptions(result).items(), covered_errors(result)
+    rows = [_assumption_row(name, entry, covered) for name, entry in stored if name in ASSUMPTIONS]
     if not rows:
         return ""
     head = ("assumption", "by the data", "considered", "verdict", "what it would mean if it did not hold")
-    return "<h3>Assumptions</h3>" + table(head, rows)
+    return "<h3>Assumptions</h3>" + table(head, rows, "stacked")
 
 
-def _assumption_row(name: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
+def _assumption_row(name: str, entry: Mapping[str, Any], covered: Mapping[str, float]) -> tuple[str, ...]:
+    """Name, estimate, what is considered, verdict and meaning of an assumption.
+
+    Args:
+        covered: estimates of those that are off, while the sigmas have their step.
+    """
     unit = ASSUMPTIONS[name].unit
     estimate, spread, considered = (entry.get(key) for key in ("estimate", "estimate_sigma", "sigma"))
     tested = isinstance(estimate, int | float) and isinstance(spread, int | float)
     found = ASSUMPTIONS[name].figure(float(estimate), float(spread)) if tested else "not tested"  # type: ignore[arg-type]
+    considered = abs(covered[name]) if name in covered else considered
     part = f"±{considered:.2g} {unit}".rstrip() if isinstance(considered, int | float) else ""
-    held = "holds" if tested else "its effect is in the sigmas"
-    said = f"contradicted: {ASSUMPTIONS[name].remedy}" if entry.get("contradicted") else held
+    said = "holds" if tested else "its effect is in the sigmas"
+    if name in covered:
+        said = f"off; its step is in the sigmas. To take it out, {ASSUMPTIONS[name].remedy}"
+    elif entry.get("contradicted"):
+        said = f"contradicted: {ASSUMPTIONS[name].remedy}"
     return name, found, part, said, ASSUMPTIONS[name].violation

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import re
 from dataclasses import replace
 
 import gtsam
@@ -25,6 +26,7 @@ from sst_graph.inspect.inspection import (
     weakest_direction,
 )
 from sst_graph.inspect.inspection_text import (
+    advice_sentences,
     correlation_sentence,
     frame_list,
     inspection_text,
@@ -164,6 +166,22 @@ def test_the_text_of_a_result_with_frames() -> None:
     assert "predicted for 7 more frames" in text and "record 7 frames" in text
     assert "(1 of 3: no sigma grows by more than 1 % without it): 4" in text
     assert "weak directions: none past the limits" in text
+
+
+def test_changes_that_are_the_same_after_rounding_are_left_out() -> None:
+    inspection = inspect_result(result_of(np.diag(SIGMAS**2), FRAMES), next_frames=7)
+    plan = inspection.plan
+    assert plan is not None
+    nearly = replace(plan.best, sigmas=plan.best.sigmas * 1.0001)
+    twice = replace(plan.best, sigmas=plan.best.sigmas * 2.0)
+    first, *_, last = plan.views
+    same = replace(plan, nearer=nearly, views=(first, replace(last, prediction=first.prediction)))
+    other = replace(plan, views=(first, replace(last, prediction=twice)))
+    every, fewer = (" ".join(advice_sentences(inspection, one)) for one in (other, same))
+    assert "half as far: " in every and "what is in view" in every
+    assert "half as far" not in fewer and "what is in view" not in fewer and "record 7 frames" in fewer
+    for before, after in re.findall(r"([\d.]+) -> ([\d.]+)", every):
+        assert before != after
 
 
 def test_the_text_without_frames_says_so() -> None:

@@ -24,6 +24,7 @@ from streets import CROWDED_STREET, crowded_street
 from sst_graph import CalibrationConfig, calibrate
 from sst_graph.assumptions.of_camera import FOCAL
 from sst_graph.fit import Fit
+from sst_graph.inspect.inspection import inspect_result
 from sst_graph.inspect.verdict import verdict
 from sst_graph.report import ReportInputs, report_html
 from sst_graph.report.close_ups import COUNT, ZOOM, telling_detections
@@ -152,6 +153,8 @@ def test_charts_have_no_ids_and_take_their_colours_from_the_page(by: str) -> Non
 PROBE = (
     "<script>addEventListener('load', () => setTimeout(() => { parent.document.title = JSON.stringify({"
     "wide: document.documentElement.scrollWidth, window: innerWidth, "
+    "cut: [...document.querySelectorAll('pre, .lines, .stacked, .numbers')]"
+    ".filter(e => e.getBoundingClientRect().right > innerWidth).length, "
     "back: getComputedStyle(document.body).backgroundColor, "
     "drawn: [...document.querySelectorAll('canvas')].map(c => { const d = c.getContext('2d')"
     ".getImageData(0, 0, c.width, c.height).data; return new Set(d).size; }), "
@@ -194,6 +197,7 @@ def test_a_browser_runs_the_page_without_an_error(tmp_path: Path, by: str, width
     assert [line for line in log.splitlines() if "CONSOLE" in line] == []
     assert seen["window"] == width and seen["wide"] <= width
     assert seen["back"] == ("rgb(20, 23, 27)" if dark else "rgb(255, 255, 255)")
+    assert seen["cut"] == 0
     assert len(seen["drawn"]) == seen["sliders"] == 3 and min(seen["drawn"]) > 50
 
 
@@ -251,6 +255,81 @@ def test_a_reason_is_listed_once() -> None:
     assert (
         full.count("the roll is hardly known") == full.count("the pitch is hardly known: record pitch") == 1
     )
+
+
+def test_a_result_not_to_be_used_predicts_nothing() -> None:
+    """Neither what is still to record nor how far off it may be: its sigmas are not to be trusted."""
+    good = replace(_result(), fit=None)
+    bad = replace(good, status="not_converged", reasons=("the clock jumps: check it",))
+    said, refused = (report_html(ReportInputs(one, [crowded_street()])) for one in (good, bad))
+    for words in ("19 times in 20", "driving at 10 m/s", "each at another place:", "The weakest, at "):
+        assert words in said and words not in refused
+
+
+def test_the_weakest_direction_is_named_beside_a_remark() -> None:
+    """By edges, whose remark stands where reasons do; unless a reason names it."""
+    weakest = inspect_result(result_by_edges()).weakest.sentence
+    for reasons, expected in (((), 1), (("the lens is a little off",), 1), ((f"{weakest}: record more",), 0)):
+        result = replace(result_by_edges(), fit=None, reasons=reasons)
+        page = report_html(ReportInputs(result, [street_by_edges()]))
+        assert page.count(f"its limit: {html.escape(weakest)}") == expected
+
+
+def test_without_a_start_there_is_no_before() -> None:
+    page = report_html(ReportInputs(replace(_result(), initial=None), [crowded_street()]))
+    assert "The cloud in the pictures" in _checked(page).headings
+    assert "Before and after" not in page and "move the slider" not in page
+
+
+def test_a_lens_that_is_off_and_covered_is_not_called_contradicted() -> None:
+    k1 = {"sigma": 0.001, "sensitivity": [0.0] * 7, "estimate": 0.0154, "estimate_sigma": 0.0042}
+    result = replace(
+        result_by_edges(), fit=None, diagnostics={"assumptions": {"k1": k1 | {"contradicted": True}}}
+    )
+
+    def row(result: CalibrationResult) -> list[str]:
+        page = report_html(ReportInputs(result, [street_by_edges()]))
+        (found,) = re.findall(r'<th scope="row">k1</th>(.*?)</tr>', page)
+        return re.findall(r'data-head="([^"]*)">([^<]*)<', found)
+
+    assert result.method == "edges" and result.status == "ok"
+    cells = dict(row(result))
+    assert cells["by the data"] == "k1 = 0.0154 ± 0.0042" and cells["considered"] == "±0.015"
+    assert cells["verdict"].startswith("off; its step is in the sigmas. To take it out, undistort")
+    refused = dict(row(replace(result, status="not_converged", reasons=("the pictures look distorted",))))
+    assert refused["verdict"].startswith("contradicted: undistort") and refused["considered"] == "±0.001"
+
+
+@pytest.mark.parametrize("by", PAGES)
+def test_bars_of_objects_have_names_under_their_numbers(by: str) -> None:
+    (chart,) = re.findall(r"<h3>By object</h3>.*?</figure>", PAGES[by](), re.DOTALL)
+    names = re.findall(r"<li>(.*?)</li>", chart)
+    assert names == re.findall(r"<title>(.*?)</title>", chart) and len(names) >= 2
+    assert all(
+        re.fullmatch(r"[a-z ]+ at \d+ m, .*, \d+ points in \d+ frames?: [+-]\d\.\d\d px", one)
+        for one in names
+    )
+    assert (
+        ">1</text>" in chart
+        and ">0.5</text>" not in chart[chart.index(">1</text>") : chart.index("object, ")]
+    )
+
+
+@pytest.mark.parametrize("by", PAGES)
+def test_no_zero_has_a_minus_sign(by: str) -> None:
+    words = re.sub(r"<script.*?</script>|<style>.*?</style>| d=\"[^\"]*\"", "", PAGES[by](), flags=re.DOTALL)
+    assert not re.search(r"-0\.0+(?!\d)", words)
+
+
+def test_an_ellipse_says_what_it_means_where_the_two_hardly_separate() -> None:
+    covariance = np.diag(np.square(SIGMAS))
+    for value in (0.4, -0.9):
+        covariance[3, 6] = covariance[6, 3] = value * SIGMAS[3] * SIGMAS[6]
+        result = replace(_result(), fit=None, covariance=covariance.copy())
+        page = report_html(ReportInputs(result, [crowded_street()]))
+        (caption,) = re.findall(r"Correlation [+-]0.[49]0[^<]*", page)
+        assert ("hardly tell the two apart" in caption) == (value == -0.9)
+        assert "Translation x against time offset" in page
 
 
 def test_without_a_fit_there_are_no_residuals() -> None:
@@ -331,6 +410,27 @@ def test_close_ups_without_labels_show_the_edge_that_each_point_is_compared_with
         assert np.abs((across * along).sum(axis=1)) == pytest.approx(0.0, abs=0.06 * lengths.max() + 3.0)
         assert lengths / ZOOM == pytest.approx(np.abs(written), abs=bias_px + 0.1)
         assert re.search(r"±2 sigma of the calibration moves it by ±\d+\.\d px", figure)
+
+
+def test_bars_of_close_ups_are_of_the_lens_that_is_given() -> None:
+    """What a k1 that may be off adds to the covariance is not in the bars; the caption says what it adds."""
+    step = np.array([0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 0.0])
+    k1 = {"sigma": 0.05, "sensitivity": step.tolist()}
+    plain = replace(result_by_edges(), diagnostics={})
+    wider = replace(
+        plain,
+        covariance=plain.covariance + 0.05**2 * np.outer(step, step),
+        diagnostics={"assumptions": {"k1": k1}},
+    )
+
+    def found(result: CalibrationResult) -> tuple[set[str], int]:
+        page = report_html(ReportInputs(result, [street_by_edges()]))
+        moves = re.findall(r"moves it by ±(\d+\.\d) px", page)
+        return set(moves), page.count("where the lens is off, too")
+
+    (moves, none), (others, many) = found(plain), found(wider)
+    # The objects that are shown are chosen by the whole covariance: some are the same.
+    assert moves & others and none == 0 and many >= 3
 
 
 def test_a_wrong_calibration_is_seen_on_the_page() -> None:
