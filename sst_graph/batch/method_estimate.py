@@ -116,7 +116,7 @@ def result_of(
         covariance=estimate.covariance,
         status=status,
         camera=drives[0].camera,
-        reasons=(*wrong, *estimate.remarks, *sentences),
+        reasons=(*wrong, *sentences, *estimate.remarks),
         weak_directions=weak,
         frames_used=estimate.frames,
         drive_offsets=estimate.drive_offsets,
