@@ -164,7 +164,7 @@ class Profile(ByValue):
         unknown: its number in the order of the covariance.
         steps: (k,) from the estimate, rising, 0 among them [rad, m or s].
         costs: (k,) beyond the least of them.
-        sigma: standard deviation by the curvature of this cost alone.
+        sigma: of the Gaussian whose cost, step^2 / (2 sigma^2), is nearest to these.
         best_score: that the costs are taken off from; None where they are those of matches.
     """
 

@@ -111,4 +111,11 @@ K1 = Assumption(
     prevalence=0.5,  # pictures come as they were taken about as often as undistorted
     by_edges=True,
 )
-K2 = replace(K1, name="k2", effect=_k2, prevalence=0.02, by_edges=False)
+K2 = replace(
+    K1,
+    name="k2",
+    effect=_k2,
+    prevalence=0.02,
+    by_edges=False,
+    remedy=K1.remedy.replace("k1", "k2"),
+)

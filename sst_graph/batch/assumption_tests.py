@@ -4,7 +4,9 @@ The problem is solved again with the parameters of all assumptions as variables,
 near ones: a wrong assumption moves matches beyond the last kernel, and they are found again where its
 parameter is free. With those matches frozen one linear step leads to the estimate of one parameter while all
 others hold, with its cluster-robust covariance. The estimate over its deviation decides (Wald). What is
-contradicted most is solved for once more, alone and from where that step leads, to state its estimate.
+contradicted most is solved for once more, alone and from where that step leads: that solution must confirm
+it. One that explains less of what is in view than the estimate does is another optimum and says nothing: wide
+kernels lead there where few objects are seen. What is not confirmed leaves the next one to be tried.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ from sst_graph.errors import EstimationError
 from sst_graph.graph.building import state_from
 from sst_graph.graph.elimination import Eliminated, Unknowns
 from sst_graph.graph.linear import scaled_inverse
-from sst_graph.graph.outer_loop import JointSolution, solve_joint
+from sst_graph.graph.outer_loop import JointSolution, explained, solve_joint
 from sst_graph.graph.state import State, nuisance_key
 from sst_graph.objects.tracks import ObjectId
 from sst_graph.types import FloatArray
@@ -150,9 +152,13 @@ def check_assumptions(problem: SolvedProblem, config: AssumptionConfig) -> tuple
     try:
         linear = LinearProblem.of(problem, names)
         findings = sorted((linear.alone(name, config) for name in names), key=lambda f: -f.score)
-        if findings and findings[0].contradicted:
-            findings[0] = _solved_alone(problem, findings[0], linear.start_of(findings[0]), config)
-        return tuple(findings)
+        for finding in [each for each in findings if each.contradicted]:
+            findings.remove(finding)
+            alone = _solved_alone(problem, finding, linear.start_of(finding), config)
+            if alone is not None and alone.contradicted:
+                return (alone, *findings)
+            findings += [] if alone is None else [alone]
+        return tuple(sorted(findings, key=lambda f: -f.score))
     except (EstimationError, np.linalg.LinAlgError) as error:
         _LOG.info("assumptions not tested: %s", error)
         return ()
@@ -240,8 +246,8 @@ def _centred(table: MatchTable, bread: FloatArray) -> MatchTable:
 
 def _solved_alone(
     problem: SolvedProblem, finding: ParameterTest, start: State, config: AssumptionConfig
-) -> ParameterTest:
-    """The finding from a solution with its parameter alone; unchanged where that solution disagrees."""
+) -> ParameterTest | None:
+    """The finding from a solution with its parameter alone; None where that solution is another optimum."""
     name = finding.assumption.name
     try:
         solution = problem.solve_with(
@@ -250,15 +256,15 @@ def _solved_alone(
     except EstimationError as error:
         _LOG.info("assumption %s: %s", name, error)
         return finding
+    if explained(solution) < explained(problem.solution):
+        return None
     robust = robust_covariance(
         solution.graph, solution.values, solution.pairs, solution.state, problem.objects
     )
     column = robust.unknowns.column(nuisance_key(name))
     value, sigma = solution.state.nuisances[name], float(np.sqrt(robust.matrix[column, column]))
     sigma *= few_objects_factor(int(robust.table.objects.max()) + 1, config.threshold)
-    alike = abs(value - finding.value) < config.threshold * max(sigma, finding.sigma)
-    same = alike and finding.assumption.contradicted_by(value, sigma, config.threshold)
-    return replace(finding, value=value, sigma=sigma) if same else finding
+    return ParameterTest.of(finding.assumption, value, sigma, config.threshold)
 
 
 def with_further_tests(

@@ -26,11 +26,11 @@ from sst_graph.batch.causes import with_causes
 from sst_graph.batch.config import CalibrationConfig, Method, prepared_classes
 from sst_graph.batch.contradictions import Contradictions, find_contradictions
 from sst_graph.batch.joint_report import (
+    assumed_motion,
     fit_of,
     joint_diagnostics,
     joint_reasons,
     label_agreement,
-    unknown_motion_remarks,
 )
 from sst_graph.batch.method_estimate import (
     MethodEstimate,
@@ -235,7 +235,8 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
         total.covariance,
         frames_used(drives, solution),
         (*_contradicted(tests, contradictions, wrong), *motion.reasons, *total.reasons),
-        (*unknown_motion_remarks(drives), *motion.remarks, *total.remarks),
+        (*motion.remarks, *total.remarks),
+        assumed_motion(drives),
         motion.estimate.by_static_objects[:7, :7],
         drive_offsets(drives, solution.state, unknowns),
         total.by_drive,

@@ -57,7 +57,7 @@ def joint_reasons(
     )
 
 
-def unknown_motion_remarks(drives: Sequence[Drive]) -> tuple[str, ...]:
+def assumed_motion(drives: Sequence[Drive]) -> tuple[str, ...]:
     """What was assumed of drives whose motion is not known."""
     if all(drive.lidar_motions for drive in drives):
         return ()

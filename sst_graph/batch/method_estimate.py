@@ -64,6 +64,7 @@ class MethodEstimate:
         frames: that took part.
         reasons: why the estimate may be wrong altogether; any makes the status ``not_converged``.
         remarks: notes for the reader that do not change the status.
+        assumed: what was assumed where the data are silent: said before the directions that it leaves open.
         by_static_objects: (7, 7) covariance by static objects alone, and by motion where used.
         drive_offsets: an offset for each drive, with ``time_offset_per_drive``.
         by_drive: how well each of them is known.
@@ -85,6 +86,7 @@ class MethodEstimate:
     frames: tuple[FrameId, ...]
     reasons: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
+    assumed: tuple[str, ...] = ()
     by_static_objects: FloatArray | None = None
     drive_offsets: tuple[DriveOffset, ...] = ()
     by_drive: tuple[DriveCovariance, ...] = ()
@@ -116,7 +118,7 @@ def result_of(
         covariance=estimate.covariance,
         status=status,
         camera=drives[0].camera,
-        reasons=(*wrong, *estimate.remarks, *sentences),
+        reasons=(*wrong, *estimate.assumed, *sentences, *estimate.remarks),
         weak_directions=weak,
         frames_used=estimate.frames,
         drive_offsets=estimate.drive_offsets,

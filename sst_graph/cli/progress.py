@@ -18,7 +18,7 @@ ProgressStage = Callable[[int, int], None]
 """Called with (steps done, steps in all) of one stage."""
 
 FIRST_S, EVERY_S = 2.0, 10.0
-"""A stage that takes longer than the first has a line, and another each time the second has gone by [s]."""
+"""Work that takes longer than the first has a line, and another each time the second has gone by [s]."""
 
 PREFIX = "progress: "
 """Begins every plain line, behind the program's name."""
@@ -30,7 +30,7 @@ class ProgressBar:
     def __init__(self) -> None:
         self._bar: tqdm | None = None
         self._stage, self._total = "", 0
-        self._next_line_s = 0.0
+        self._next_line_s = time.monotonic() + FIRST_S
 
     def __enter__(self) -> ProgressBar:
         return self
@@ -47,7 +47,6 @@ class ProgressBar:
             self._stage, self._total = stage, total
             hidden = True if loudness.quiet else None  # None: hidden where stderr is no terminal
             self._bar = tqdm(total=total, desc=stage, file=sys.stderr, disable=hidden, leave=False)
-            self._next_line_s = time.monotonic() + FIRST_S
         if self._bar.disable:
             self._say_line(done)
         else:

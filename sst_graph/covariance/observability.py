@@ -43,7 +43,7 @@ class Advice:
 
 SILHOUETTES = Advice(
     together="record a stop, a change of speed or a turn",
-    offset="record motion, several frames at some speed, with a change of speed or a turn",
+    offset="record motion with a change of speed or a turn",
     rotation="record objects on all sides of the image, near and far",
     translation="record objects nearer to the sensors, at several distances",
 )
@@ -245,7 +245,7 @@ def _words(
         "offset": abs(float(vector[6])),
     }
     translation_m = float(np.linalg.norm(c_translation))
-    words = _axis_words(c_translation)
+    words, either_way = _axis_words(c_translation)
     if traded and parts["offset"] > _TAKES_PART and parts["translation"] > _TAKES_PART:
         rate_ms = abs(time_offset_s) * 1e3 / translation_m if translation_m else 0.0
         sign = "later" if time_offset_s > 0 else "earlier"
@@ -276,7 +276,7 @@ def _words(
         )
     return (
         f"the translation is known to {100 * np.linalg.norm(alone[3:6]):.1f} cm only (one sigma), "
-        f"the LiDAR {words}",
+        f"{either_way}",
         advice.translation,
     )
 
@@ -292,8 +292,9 @@ def _rotation_axis(rotation: FloatArray) -> str:
     return f"the axis [{x:.2f}, {y:.2f}, {z:.2f}] of the LiDAR's frame"
 
 
-def _axis_words(c_translation: FloatArray) -> str:
-    """Direction of a shift in the camera frame, in a word."""
+def _axis_words(c_translation: FloatArray) -> tuple[str, str]:
+    """Direction of a shift in the camera frame, and its axis, in words."""
     names = (("right", "left"), ("down", "up"), ("forward", "backward"))
     axis = int(np.abs(c_translation).argmax())
-    return "shifted " + names[axis][0 if c_translation[axis] > 0 else 1]
+    way = names[axis][0 if c_translation[axis] > 0 else 1]
+    return f"shifted {way}", " or ".join(names[axis])

@@ -40,7 +40,9 @@ class Deviation:
 
 def taken(scene: Scene, index: IntArray) -> Scene:
     """The scene of some of the points, by position."""
-    return scene if np.ndim(scene.image_s) == 0 else replace(scene, image_s=np.asarray(scene.image_s)[index])
+    if np.ndim(scene.image_s) == 0:
+        return scene
+    return replace(scene, image_s=np.asarray(scene.image_s)[index], l_twist=scene.l_twist[index])
 
 
 def deviation_of(nuisances: Mapping[str, float], scene: Scene) -> Deviation | None:
@@ -58,7 +60,8 @@ def moved_twists(samples: TwistSamples, nuisances: Mapping[str, float], scene: S
     deviation = deviation_of(nuisances, scene)
     if deviation is None:
         return samples
-    shift = deviation.effect(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2))).twist_shift
+    n = len(samples.twists)
+    shift = deviation.effect(np.zeros((n, 3)), np.zeros(n), np.zeros((n, 2))).twist_shift
     return samples if shift is None else replace(samples, twists=samples.twists + shift)
 
 

@@ -46,7 +46,6 @@ def profiles(
         matches: how many the problem has.
     """
     system = frozen.linearized(optimum)
-    curvature = np.sqrt(np.diag(system.covariance()))
     counts = _STEPS if matches < _LARGE else _FEW_STEPS
     found = []
     for unknown in range(7):
@@ -61,8 +60,8 @@ def profiles(
                 steps.append(step)
                 costs.append(frozen.linearized(point).cost)
         order = np.argsort(steps)
-        rising = np.array(costs)[order] - min(costs)
-        found.append(Profile(unknown, np.array(steps)[order], rising, float(curvature[unknown])))
+        profile = _profile(unknown, np.array(steps)[order], np.array(costs)[order] - min(costs))
+        found.append(profile)
     return tuple(found)
 
 
@@ -102,10 +101,14 @@ def score_profiles(
         steps = np.concatenate([-steps[::-1], [0.0], steps])
         scores = np.array([middle if step == 0.0 else score(step * way) for step in steps])
         costs = scores.max() - scores
-        # The Gaussian's cost, step^2 / (2 sigma^2), that is nearest to the costs.
-        sigma = np.sqrt((steps**4).sum() / max(2.0 * float(steps**2 @ costs), 1e-300))
-        found.append(Profile(unknown, steps, costs, float(sigma), float(scores.max())))
+        found.append(_profile(unknown, steps, costs, float(scores.max())))
     return tuple(found)
+
+
+def _profile(unknown: int, steps: FloatArray, costs: FloatArray, best_score: float | None = None) -> Profile:
+    """A profile, with the Gaussian of cost step^2 / (2 sigma^2) that is nearest to its costs."""
+    sigma = np.sqrt((steps**4).sum() / max(2.0 * float(steps**2 @ costs), 1e-300))
+    return Profile(unknown, steps, costs, float(sigma), best_score)
 
 
 def _with_motion_in(other: FloatArray, paired: PairedEdges) -> PairedEdges:

@@ -465,7 +465,7 @@ def _camera_result(
         covariance=covariance,
         status=status,
         camera_name=name,
-        reasons=(*wrong, *kept, *sentences),
+        reasons=(*wrong, *kept, *sentences) if not_converged else (*sentences, *kept),
         weak_directions=weak,
         diagnostics={**diagnostics, **quality_of(fit), "by_own_images": alone},
         fit=fit,

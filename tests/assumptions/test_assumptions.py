@@ -124,6 +124,18 @@ def test_several_parameters_add_up() -> None:
     np.testing.assert_allclose(np.linalg.norm(both.l_shift, axis=1), 0.1)
 
 
+def test_some_of_the_points_keep_the_motion_of_their_image() -> None:
+    """An effect may depend on the motion around each point's image."""
+    twists, stamps_s = np.outer(np.arange(4.0), L_TWIST), np.arange(4.0)
+    each = Deviation({"range_scale": 0.1}, Scene(CAMERA, twists, stamps_s, 0.1))
+    some = each.take(np.array([3, 1]))
+    np.testing.assert_array_equal(some.scene.l_twist, twists[[3, 1]])
+    np.testing.assert_array_equal(some.scene.image_s, [3.0, 1.0])
+    found = some.effect(points(2), np.zeros(2), np.zeros((2, 2))).twist_shift
+    assert found is not None
+    np.testing.assert_allclose(found[:, 3:], 0.1 * twists[[3, 1], 3:])
+
+
 @pytest.mark.parametrize("name", ASSUMPTIONS)
 def test_every_assumption_has_violation_remedy_and_source(name: str) -> None:
     assumption = ASSUMPTIONS[name]

@@ -40,23 +40,32 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 
 @pytest.mark.usefixtures("lines")
-def test_a_stage_over_two_seconds_has_lines(clock: list[float], capsys: pytest.CaptureFixture[str]) -> None:
+def test_work_over_two_seconds_has_lines(clock: list[float], capsys: pytest.CaptureFixture[str]) -> None:
     with ProgressBar() as progress:
         solve = progress.stage("solve")
-        # The stage begins with its first call, at 0.5 s.
         for done, seconds in enumerate((0.5, 2.1, 3.0, 12.0, 13.1), 1):
             clock[0] = 100.0 + seconds
             solve(done, 8)
     assert (FIRST_S, EVERY_S) == (2.0, 10.0)
     said = capsys.readouterr().err.splitlines()
-    assert said == ["sst-graph: progress: solve: 3 of 8 (38 %)", "sst-graph: progress: solve: 5 of 8 (62 %)"]
+    assert said == ["sst-graph: progress: solve: 2 of 8 (25 %)", "sst-graph: progress: solve: 5 of 8 (62 %)"]
 
 
 @pytest.mark.usefixtures("lines")
-def test_short_stages_are_silent(clock: list[float], capsys: pytest.CaptureFixture[str]) -> None:
+def test_short_stages_count_together(clock: list[float], capsys: pytest.CaptureFixture[str]) -> None:
     with ProgressBar() as progress:
         for k in range(20):
             clock[0] += 1.0
+            progress(f"stage {k}", 1, 1)
+    said = capsys.readouterr().err.splitlines()
+    assert said == [f"sst-graph: progress: stage {k}: 1 of 1 (100 %)" for k in (1, 11)]
+
+
+@pytest.mark.usefixtures("lines")
+def test_short_work_is_silent(clock: list[float], capsys: pytest.CaptureFixture[str]) -> None:
+    with ProgressBar() as progress:
+        for k in range(3):
+            clock[0] += 0.6
             progress(f"stage {k}", 1, 1)
     assert capsys.readouterr().err == ""
 

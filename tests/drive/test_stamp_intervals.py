@@ -167,3 +167,11 @@ def test_a_drive_whose_clock_jumps_has_no_one_offset() -> None:
         assert result.status == status
     (reason,) = result.reasons
     assert "image stamps jumped by +30 ms" in reason and "at frame 45" in reason
+
+
+def test_what_makes_a_result_not_ok_is_said_before_remarks() -> None:
+    covariance = np.diag([1e-8] * 6 + [1.0])
+    answer = MethodEstimate(gtsam.Pose3(), 0.0, covariance, (), remarks=("the lens is a little off",))
+    result = result_of(answer, [long_drive(0.0)], Guess(None), CalibrationConfig())
+    assert result.status == "unobservable"
+    assert "time offset" in result.reasons[0] and result.reasons[1:] == ("the lens is a little off",)
