@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from textwrap import wrap
 
 import gtsam
 import numpy as np
@@ -22,6 +23,8 @@ from sst_graph.result import CalibrationResult
 OFFSET_SIGN = "t_lidar = t_camera_stamp + offset"
 
 
+_SENTENCES, _WIDTH = ("verdict", "sweep"), 100
+"""Names of the lines that are sentences, and the letters of one line of them."""
 _WITH_LABELS = (
     "More frames reduce matches and motion. The others are assumptions that no residual shows, such as a "
     "principal point (cx, cy) or a distortion (k1, k2) that is off by the amount named."
@@ -53,8 +56,23 @@ class Comparison:
 
 def summary(result: CalibrationResult, comparison: Comparison | None = None) -> str:
     """The result in a dozen lines: numbers with sigmas, status, unobservable directions."""
-    rows = summary_rows(result, comparison)
-    return "\n".join(f"{name:<15} {text}".rstrip() for name, text in rows)
+    return _lines(summary_rows(result, comparison))
+
+
+def verdict_and_summary(result: CalibrationResult, comparison: Comparison | None = None) -> str:
+    """The summary of a result; of one that is ok below its verdict. What makes another one not ok is the
+    summary's reason already."""
+    first = [("verdict", verdict(result))] if result.status == "ok" else []
+    return _lines([*first, *summary_rows(result, comparison)])
+
+
+def _lines(rows: Sequence[tuple[str, str]]) -> str:
+    """Rows of name and text as lines of text, sentences broken where they are long."""
+    lines = []
+    for name, text in rows:
+        parts = wrap(text, _WIDTH) if name in _SENTENCES else [text]
+        lines += [f"{'' if k else name:<15} {part}".rstrip() for k, part in enumerate(parts)]
+    return "\n".join(lines)
 
 
 def summary_rows(result: CalibrationResult, comparison: Comparison | None = None) -> list[tuple[str, str]]:

@@ -46,17 +46,19 @@ def verdict(result: CalibrationResult) -> str:
     return f"Good to {_known(result)}"
 
 
-def quality_line(quality: FitQuality) -> str:
-    """Shares of close points, as a line for a terminal."""
+def quality_line(quality: FitQuality, result: CalibrationResult) -> str:
+    """Shares of close points of a result, as a line for a terminal."""
     by_labels = quality.by_chance is None
+    # What a wrong calibration allows tells nothing: it meets few contours, and those by chance. What edges
+    # allow falls with the calibration itself.
+    compared = by_labels and result.status != "not_converged"
     others = {"at the start": quality.share_at_start, "at random rotations": quality.by_chance}
     shares = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in others.items() if share is not None)
     return (
         f"{100.0 * quality.share:.0f} % of {count_of(quality.points, 'boundary point')} within "
         f"{CLOSE_PX:g} px of the "
         f"{'contour' if by_labels else 'strongest edge nearby'}{f' ({shares})' if shares else ''}"
-        # What edges allow falls with the calibration itself: it would not tell one that is wrong.
-        + (f"; labels like these allow {100.0 * quality.attainable:.0f} %" if by_labels else "")
+        + (f"; labels like these allow {100.0 * quality.attainable:.0f} %" if compared else "")
     )
 
 
@@ -67,11 +69,12 @@ def fit_line(result: CalibrationResult) -> str:
         return edges_line(result)
     of_edges = FitQuality.from_diagnostics(result.diagnostics, EDGES_QUALITY)
     if of_edges is not None:
-        return f"labels: {quality_line(quality)}; edges in frames without labels: {quality_line(of_edges)}"
+        by_labels, by_edges = quality_line(quality, result), quality_line(of_edges, result)
+        return f"labels: {by_labels}; edges in frames without labels: {by_edges}"
     if result.fit_is_check:
-        return f"{CHECK_BY_EDGES}: {quality_line(quality)}"
+        return f"{CHECK_BY_EDGES}: {quality_line(quality, result)}"
     contrast = "" if quality.by_chance is None else edges_line(result)
-    return "; ".join(line for line in (contrast, quality_line(quality)) if line)
+    return "; ".join(line for line in (contrast, quality_line(quality, result)) if line)
 
 
 def edges_line(result: CalibrationResult) -> str:

@@ -22,7 +22,7 @@ from sst_graph.cli.rig import given_cameras, refuse_rig_options, run_rig
 from sst_graph.cli.video import videos_beside
 from sst_graph.files import atomic_directory
 from sst_graph.files.strict_json import strict_json
-from sst_graph.inspect.report import Comparison, summary
+from sst_graph.inspect.report import Comparison, verdict_and_summary
 from sst_graph.result import WALL_CLOCK, CalibrationResult
 from sst_graph.types import Source
 
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
             result = dataclasses.replace(result, read_as=with_image_topic(read_as, sources))
             # The numbers first: what follows may find the disk full.
             if not args.json:
-                mention(summary(result, against))
+                mention(verdict_and_summary(result, against))
             names = write_calibration(folder, result, sources, against, not args.no_report)
             for video in videos:
                 names += video.write_inside(folder, result, sources)

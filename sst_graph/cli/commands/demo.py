@@ -11,7 +11,7 @@ from sst_graph.cli.outputs import exit_code, write_calibration
 from sst_graph.cli.progress import ProgressBar
 from sst_graph.data import open_source
 from sst_graph.files import OutputKind, atomic_directory
-from sst_graph.inspect.report import summary
+from sst_graph.inspect.report import verdict_and_summary
 from sst_graph.metrics import CalibrationErrors
 from sst_graph.simulator import SimulationConfig, fill_drive, simulate
 
@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
         source = open_source(folder / DRIVE, camera=CAMERA)
         result, against = calibrate_drives([source], source.nominal, 0.0, CalibrationConfig(), CAMERA)
         (folder / CALIBRATION).mkdir()
-        mention(summary(result, against))
+        mention(verdict_and_summary(result, against))
         names = write_calibration(folder / CALIBRATION, result, [source], against)
     mention(f"{'wrote':<15} {args.out}/{DRIVE}, {args.out}/{CALIBRATION}: {', '.join(names)}")
     if against is None:
