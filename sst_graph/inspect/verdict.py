@@ -100,8 +100,10 @@ def edges_line(result: CalibrationResult) -> str:
 def _known(result: CalibrationResult) -> str:
     degrees, cm, ms = largest_sigmas(result)
     one = misfit_at(result, MIDDLE_M)
+    # Of a calibration that is open by degrees the corners say nothing more.
+    worth_saying = one.more_in_corners and result.status == "ok"
     lens = "where the lens counts, " if one.lens_counts else ""
-    corners = f"; in the corners, {lens}{figure(one.corner_px)} px" if one.more_in_corners else ""
+    corners = f"; in the corners, {lens}{figure(one.corner_px)} px" if worth_saying else ""
     return (
         f"{figure(degrees)}° and {figure(cm)} cm (one sigma): at {one.depth_m:.0f} m the cloud may be "
         f"{figure(one.pixels)} px off in the middle of the picture{corners}. "
