@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 
 from sst_graph.cli import main
-from sst_graph.cli.commands.experiment import code_version
 from sst_graph.experiments.paper.tables import STATE
+from sst_graph.experiments.tasks.code_version import code_version
 
 PROGRAM = [sys.executable, "-m", "sst_graph", "experiment"]
 DRIVES = Path(__file__).resolve().parents[4] / "shared" / "data"
