@@ -114,7 +114,7 @@ def test_the_commit_of_tables_follows_them_alone(tmp_path: Path) -> None:
     git("add", "page.md")
     git("commit", "-qm", "measured")
     first = git("rev-parse", "--short", "HEAD")
-    assert f"`{first}`" in make_provenance.origin(page)
+    assert f"last edited in commit `{first}`" in make_provenance.origin(page)
     page.write_text(page.read_text() + "\nMore words.\n")
     git("commit", "-qam", "words")
     assert f"`{first}`" in make_provenance.origin(page)
