@@ -1,4 +1,4 @@
-"""Fails when a hot path takes a quarter more instructions than ``guard.json`` says.
+"""Fails when a hot path takes more than 1.2 times the instructions that ``guard.json`` says.
 
     python -m benchmarks.guard
     python -m benchmarks.guard --renew

@@ -1,4 +1,7 @@
-"""The commit that the figures of a page come from, as its last line: git says it, so they cannot part."""
+"""The commit in which the tables of a page were last edited, as its last line: git says it.
+
+Which code made their figures stands in the page, where a command wrote it.
+"""
 
 from __future__ import annotations
 
@@ -20,9 +23,7 @@ def origin(page: Path) -> str:
     if not last:
         return ""
     commit, date = last.split()
-    line = (
-        f"The tables of this page are those of commit `{commit}` ({date}), the last that changed one of them."
-    )
+    line = f"The tables of this page were last edited in commit `{commit}` ({date})."
     if _git(page, "diff", "HEAD", "--name-only", f"-G{TABLE}", "--", page.name):
         line += " **Some have changed since and are not committed.**"
     return f"\n\n---\n\n*{line}*\n"

@@ -147,7 +147,7 @@ def add_bad_drives(folder: Path) -> list[Path]:
         if not path.exists():
             shutil.copytree(whole, path)
     (cut / "sequences/00/calib.txt").write_text("P0: 700 0")
-    (spoilt / "sequences/00/times.txt").write_text("0.0\nnoon\n")
+    min((spoilt / "sequences/00/image_2").iterdir()).write_bytes(b"no picture")
     empty.mkdir(exist_ok=True)
     return [cut, spoilt, empty]
 

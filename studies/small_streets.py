@@ -29,7 +29,7 @@ from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drives
 from sst_graph.config import with_overrides
 from sst_graph.data.kept_drive import KeptDrive
-from sst_graph.experiments.resumable import Work, rows_of
+from sst_graph.experiments.tasks.resumable import Work, rows_of
 from sst_graph.experiments.wrong_drives import WRONG
 from sst_graph.simulator import SimulationConfig, simulate
 

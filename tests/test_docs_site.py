@@ -78,8 +78,8 @@ def test_the_site_needs_no_network_and_its_links_lead_somewhere(site: Path) -> N
 def test_a_measured_page_of_the_site_names_the_commit_of_its_tables(site: Path) -> None:
     for name in ("measured/fit", "results/accuracy", "compared/peers"):
         page = (site / f"{name}.html").read_text(encoding="utf-8")
-        assert re.search(r"those of commit <code[^>]*>.*?[0-9a-f]{7,}", page), name
-    assert "those of commit" not in (site / "start" / "first.html").read_text(encoding="utf-8")
+        assert re.search(r"last edited in commit <code[^>]*>.*?[0-9a-f]{7,}", page), name
+    assert "last edited in commit" not in (site / "start" / "first.html").read_text(encoding="utf-8")
 
 
 COMMAND = re.compile(r"sst-graph \w+|python -m \w+|make \w+|[\w/]+\.py\b")
@@ -114,7 +114,7 @@ def test_the_commit_of_tables_follows_them_alone(tmp_path: Path) -> None:
     git("add", "page.md")
     git("commit", "-qm", "measured")
     first = git("rev-parse", "--short", "HEAD")
-    assert f"`{first}`" in make_provenance.origin(page)
+    assert f"last edited in commit `{first}`" in make_provenance.origin(page)
     page.write_text(page.read_text() + "\nMore words.\n")
     git("commit", "-qam", "words")
     assert f"`{first}`" in make_provenance.origin(page)

@@ -18,8 +18,8 @@ from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import Progress
 from sst_graph.errors import ConfigError, count_of
 from sst_graph.experiments.markdown import NONE, median, median_worst, status_counts, table
-from sst_graph.experiments.resumable import Work, rows_of
 from sst_graph.experiments.starts import drive_of, truth_of
+from sst_graph.experiments.tasks.resumable import Work, rows_of
 from sst_graph.metrics import calibration_errors
 from sst_graph.simulator import SimulationConfig
 
@@ -44,7 +44,8 @@ class BasinConfig(Settings):
         start_m: half width of the starts' translation error, uniform by axis [m].
         failed_deg, failed_m: rotation (QAD) or translation (ATD) beyond which a run has failed.
         jobs: processes at a time.
-        records: file that keeps finished streets, from which a further call goes on.
+        records: file that keeps finished streets, from which a further call of the same code goes on; empty:
+            one beside --out.
         street: the rest of the streets.
         calibration: settings of the method.
     """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -12,7 +13,7 @@ from pathlib import Path
 from sst_graph.errors import DataError, SstGraphError, printable
 from sst_graph.files import MANIFEST
 from sst_graph.files.manifest import read_manifest
-from sst_graph.files.staging import claim
+from sst_graph.files.staging import SUFFIX, claim
 from sst_graph.fleet.drives import Drive
 from sst_graph.fleet.isolated import Ending, Limits, has_ended, run_isolated
 from sst_graph.fleet.places import Place
@@ -31,6 +32,8 @@ They say nothing of the drive, so they are no part of its retries; without an en
 runs would keep a batch for ever.
 """
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_UNFINISHED = re.compile(rf"\.(.+?)(?:\.[0-9a-f]{{16}})?{re.escape(SUFFIX)}$")
+"""Name of an unfinished result beside its own."""
 _PROGRAM_MODULE, _SAID_BY_IT = "sst_graph", "sst-graph: "
 
 
@@ -146,7 +149,8 @@ def _attempt(job: Job) -> Record:
             return _failed(job, "crash", f"no process could be started: {error}")
         cost = Cost(1, ending.wall_s, ending.cpu_s, ending.peak_bytes, _size(data))
         if ending.limit or ending.code not in (_EXIT_DONE, _EXIT_NOT_TRUSTED):
-            _clean(local)
+            if not has_ended():  # who ends a batch cleans up after all of its drives
+                _clean(local)
             return replace(_of_ending(job, ending), cost=cost)
         record = _of_result(job, local)
         if record is None:
@@ -231,6 +235,18 @@ def _clean(target: Path) -> None:
     """Remove what a killed process left beside its output."""
     with contextlib.suppress(OSError, SstGraphError):
         claim(Path(os.path.realpath(target))).release()
+
+
+def remove_unfinished(out: Place) -> None:
+    """Remove what killed processes of drives left in a batch's folder; what a living one writes stays.
+
+    On this machine only: a result elsewhere is written under its own name.
+    """
+    folder = out / DRIVES
+    if out.is_local and folder.is_folder():
+        found = (_UNFINISHED.match(name) for name in os.listdir(folder.url))
+        for name in {one[1] for one in found if one is not None}:
+            _clean(folder.path / name)
 
 
 def _size(path: Path) -> int:

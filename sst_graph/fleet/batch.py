@@ -22,7 +22,7 @@ from sst_graph.files.json_table import json_table
 from sst_graph.files.reading import FileKind, digest_of_file
 from sst_graph.files.staging import lock_file
 from sst_graph.files.strict_json import strict_json
-from sst_graph.fleet.attempt import DRIVES, RECORDS, Job, finished_record, run_drive
+from sst_graph.fleet.attempt import DRIVES, RECORDS, Job, finished_record, remove_unfinished, run_drive
 from sst_graph.fleet.dask_pool import run_on_dask
 from sst_graph.fleet.drives import Drive, vehicle_files
 from sst_graph.fleet.isolated import Limits
@@ -127,6 +127,8 @@ class Outcome:
 def open_batch(out: Place, options: Sequence[str]) -> Iterator[None]:
     """Take the folder of a batch, new or begun before with the same options.
 
+    What a killed run left unfinished there is removed.
+
     Raises:
         ConfigError: it holds something else, or a batch with other options, or another run is at it.
         DataError: it cannot be read or written.
@@ -158,6 +160,7 @@ def open_batch(out: Place, options: Sequence[str]) -> Iterator[None]:
             }
             (out / BATCH).write((strict_json(document) + "\n").encode("utf-8"))
         sweep_scratch()
+        remove_unfinished(out)
         yield
 
 

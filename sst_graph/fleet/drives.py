@@ -18,6 +18,8 @@ _NOT_IN_A_NAME = re.compile(r"[^\w.=+-]+")
 _PATTERN = re.compile(r"[*?\[]")
 _COMMENT = re.compile(r"(^|\s)#.*")
 _LONGEST_NAME = 150  # bytes
+BAGS = (".bag", ".mcap", ".db3")
+"""How files end that are drives; of all others in a folder of drives none is one."""
 MOST_DRIVES = 1_000_000
 
 _DATES = (
@@ -59,6 +61,9 @@ class Drive:
 def find_drives(what: str, name_parts: int = 1) -> list[Drive]:
     """The drives that a folder, a pattern or a list names, in the order of the list or of their names.
 
+    Of a folder they are its folders and its bags; other files that lie there are left out
+    (:func:`loose_files`).
+
     A list is a text file with one path or URL a line (# after a blank begins a comment), or a CSV with a
     column ``drive`` and any of ``name``, ``vehicle`` and ``date``. Paths in it are relative to where the
     program was started.
@@ -75,7 +80,7 @@ def find_drives(what: str, name_parts: int = 1) -> list[Drive]:
     place = Place.of(what)
     # A name with brackets may be a folder's own.
     if place.is_folder():
-        drives = [_named(one, name_parts) for one in place.below()]
+        drives = [_named(one, name_parts) for one, folder in place.entries().items() if _holds(one, folder)]
     elif place.exists():
         drives = _of_list(place, name_parts)
     elif _PATTERN.search(what):
@@ -83,12 +88,30 @@ def find_drives(what: str, name_parts: int = 1) -> list[Drive]:
     else:
         raise ConfigError(f"{what}: found nothing, expected a folder of drives, a pattern, or a list")
     if not drives:
-        raise ConfigError(f"{what}: found no drive, expected at least one")
+        bags = ", ".join(BAGS)
+        raise ConfigError(f"{what}: found no drive, expected at least one folder or bag ({bags})")
     if len(drives) > MOST_DRIVES:
         raise ConfigError(f"{what}: found {count_of(len(drives), 'drive')}, expected at most {MOST_DRIVES}")
     _check_names(drives)
     vehicle_files(drive.vehicle for drive in drives)
     return drives
+
+
+def loose_files(what: str) -> list[str]:
+    """Names of the files in a folder of drives that are taken for no drive; none of a pattern or a list.
+
+    Raises:
+        DataError: the folder cannot be listed.
+    """
+    place = Place.of(what)
+    if not place.is_folder():
+        return []
+    return [one.name for one, folder in place.entries().items() if not _holds(one, folder)]
+
+
+def _holds(place: Place, is_folder: bool) -> bool:
+    """Whether an entry of a folder of drives may be one."""
+    return is_folder or place.name.lower().endswith(BAGS)
 
 
 def with_vehicles(drives: Sequence[Drive], given: str) -> list[Drive]:

@@ -94,13 +94,24 @@ class Place:
         Raises:
             DataError: no folder, or it cannot be listed.
         """
+        return list(self.entries())
+
+    def entries(self) -> dict[Place, bool]:
+        """The same, and whether each is a folder.
+
+        Raises:
+            DataError: no folder, or it cannot be listed.
+        """
         with _asked(self):
             if self.is_local:
-                names = sorted(os.listdir(self.url))
+                with os.scandir(self.url) as entries:
+                    kinds = {one.name: one.is_dir() for one in entries}
             else:
-                entries = self._system().ls(self.url, detail=False)
-                names = sorted({str(one).rstrip("/").rsplit("/", 1)[-1] for one in entries})
-        return [self / name for name in names if not name.startswith(".")]
+                kinds = {}
+                for one in self._system().ls(self.url, detail=True):
+                    name = str(one["name"]).rstrip("/").rsplit("/", 1)[-1]
+                    kinds[name] = kinds.get(name, False) or one["type"] == "directory"
+        return {self / name: kinds[name] for name in sorted(kinds) if not name.startswith(".")}
 
     def matches(self) -> list[Place]:
         """What a pattern with ``*``, ``?``, ``[]`` or ``**`` names, by name.

@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -42,6 +43,25 @@ def test_a_drive_in_the_place_of_a_folder_of_drives_is_told(
     assert f"note: {drive} looks like one drive (kitti); what stands in it (sequences) is taken for" in told
     assert main(["batch", str(drives), "--out", str(tmp_path / "other"), "--vehicle-from", "x(y)"]) == 2
     assert "looks like one drive" not in capsys.readouterr().err
+
+
+def test_loose_files_are_named_once_and_a_long_reason_is_short_on_the_terminal(
+    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("v1_2026-03-01", "v1_2026-03-08", "v2_2026-03-01", "v2_2026-03-08"):
+        shutil.rmtree(drives / name)
+    (drives / "empty").mkdir()
+    (drives / "README.md").write_text("x")
+    (drives / "fleet.csv").write_text("drive\n")
+    out = tmp_path / "out"
+    assert main(["batch", str(drives), "--out", str(out), "--workers", "1"]) == 3
+    said = capsys.readouterr()
+    assert f"note: {drives}: 2 files left out: README.md, fleet.csv (" in said.err
+    for text in (said.out, said.err):
+        (line,) = [one for one in text.splitlines() if "found no layout that is known" in one]
+        assert len(line) < 250 and line.endswith(" (more in records/empty.json)")
+    record = Record.from_json((out / "records/empty.json").read_bytes(), "record")
+    assert "expected KITTI odometry" in record.reason and len(record.reason) > 300
 
 
 def test_a_batch_in_the_folder_of_its_drives_goes_on(
@@ -169,6 +189,44 @@ def test_killed_drives_are_tried_again_and_a_killed_batch_goes_on(drives: Path, 
     assert max(int(row["attempts"]) for row in rows.values()) == 2
     assert main(["calibrate", str(drives / "v1_2026-03-01"), "--out", str(tmp_path / "alone"), *FAST]) == 3
     assert results(tmp_path / "alone") == results(out / "drives/v1_2026-03-01")
+
+
+LEFT = (".v1_2026-03-01.sst-graph-partial", ".v1_2026-03-08.0123456789abcdef.sst-graph-partial")
+"""Unfinished results of processes that are gone."""
+
+
+def leave(out: Path) -> list[Path]:
+    left = [out / "drives" / name for name in LEFT]
+    for folder in left:
+        (folder / "new").mkdir(parents=True)
+    return left
+
+
+def test_what_a_killed_batch_left_is_removed_when_the_next_one_begins(tmp_path: Path) -> None:
+    """Not only when its drive is run: the next one may end before. What a living process writes stays."""
+    from sst_graph.files.staging import claim
+    from sst_graph.fleet import open_batch
+
+    out = tmp_path / "out"
+    with open_batch(Place(str(out)), ()):
+        pass
+    left, stage = leave(out), claim(out / "drives" / "v2_2026-03-01")
+    (out / "drives" / "v1_2026-03-01").mkdir()
+    with open_batch(Place(str(out)), ()):
+        assert not any(one.exists() for one in left)
+        assert stage.path.exists() and (out / "drives" / "v1_2026-03-01").exists()
+    stage.release()
+
+
+def test_what_ends_a_batch_leaves_nothing_unfinished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its drives are killed where they do not heed; who waits for them may not come to clean up."""
+    from sst_graph.cli.commands.batch.ending import children_ended
+
+    monkeypatch.setattr("sst_graph.fleet.isolated._ended", threading.Event())
+    with pytest.raises(KeyError), children_ended(Place(str(tmp_path))):
+        left = leave(tmp_path)
+        raise KeyError
+    assert not any(one.exists() for one in left)
 
 
 def _is_alive(pid: int) -> bool:

@@ -102,6 +102,20 @@ def test_the_command_resumes(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert (tmp_path / "records").read_bytes() == written
 
 
+def test_what_is_done_is_kept_beside_the_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    small = ["--set", "street.frames=2", "--set", "starts=[1]", "--set", "searches_deg=[30]"]
+    small += ["--set", "searches_m=[0.6]", "--set", "street.motion=standing", "--out"]
+    command = ["experiment", "basin", "--streets", "1", *small, str(tmp_path / "basin.md")]
+    assert main(command) == 0
+    table, records = (tmp_path / "basin.md").read_text(), tmp_path / "basin.runs.jsonl"
+    written = records.read_bytes()
+    assert written.count(b"\n") == 2 and str(records) not in table
+    assert main([*command, "--overwrite"]) == 0
+    assert (tmp_path / "basin.md").read_text() == table and records.read_bytes() == written
+    assert main([*command[:-1], str(records)]) == 2
+    assert "found the same file" in capsys.readouterr().err and records.read_bytes() == written
+
+
 def test_records_of_another_kind_are_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     other = tmp_path / "other.txt"
     other.write_text("mine")

@@ -10,10 +10,10 @@ import pytest
 
 import sst_graph
 from sst_graph.cli import main
-from sst_graph.cli.commands import experiment as command
 from sst_graph.config import read_config
 from sst_graph.errors import ConfigError
 from sst_graph.experiments.registry import EXPERIMENTS, experiment
+from sst_graph.experiments.tasks.code_version import code_version, recorded_version
 
 
 @pytest.mark.parametrize(
@@ -42,13 +42,17 @@ def test_the_version_is_the_commit_in_a_checkout_and_the_package_elsewhere(
     package.mkdir()
     (package / "code.py").write_text("A = 1\n")
     monkeypatch.setattr(sst_graph, "__file__", str(package / "__init__.py"))
-    assert command.code_version() == sst_graph.__version__
+    assert code_version() == sst_graph.__version__
     git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]
     for words in (["init", "-q"], ["add", "-A"], ["commit", "-qm", "a"], ["tag", "v9"]):
         subprocess.run([*git, *words], check=True)
-    assert command.code_version() == "commit v9"
+    assert code_version() == recorded_version() == "commit v9"
     (package / "code.py").write_text("A = 2\n")
-    assert command.code_version() == "commit v9-dirty"
+    assert code_version() == "commit v9-dirty"
+    second = recorded_version()
+    (package / "code.py").write_text("A = 3\n")
+    assert code_version() == "commit v9-dirty" and second != recorded_version()
+    assert second.startswith("commit v9-dirty ")
 
 
 def test_registry() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sst_graph.errors import ConfigError, DataError, SstGraphError
-from sst_graph.fleet.drives import Drive, file_name, find_drives, with_vehicles
+from sst_graph.fleet.drives import Drive, file_name, find_drives, loose_files, with_vehicles
 from sst_graph.fleet.places import Place
 
 
@@ -31,6 +31,20 @@ def test_a_folder_a_pattern_and_a_list_name_the_same_drives(tree: Path, tmp_path
         assert [drive.name for drive in found] == expected
         assert [drive.place.url for drive in found] == [f"{tree}/v1/{name}" for name in expected]
     assert find_drives(str(table))[0].vehicle == "v1"
+
+
+def test_loose_files_in_a_folder_are_no_drives(tree: Path) -> None:
+    for name in ("README.md", "fleet.csv", "a.BAG", "b.mcap", "c.db3", ".hidden.txt"):
+        (tree / "v1" / name).write_text("x")
+    found = find_drives(str(tree / "v1"))
+    assert [drive.place.name for drive in found] == ["20260301", "20260308", "a.BAG", "b.mcap", "c.db3"]
+    assert loose_files(str(tree / "v1")) == ["README.md", "fleet.csv"]
+    # Who names them wants them.
+    assert len(find_drives(f"{tree}/v1/*.md")) == 1 and loose_files(f"{tree}/v1/*") == []
+    (tree / "loose").mkdir()
+    (tree / "loose" / "notes.txt").write_text("x")
+    with pytest.raises(ConfigError, match=r"loose: found no drive, expected at least one folder or bag"):
+        find_drives(str(tree / "loose"))
 
 
 def test_drives_of_one_name_are_refused_and_told_apart_by_the_folder_above(tree: Path) -> None:

@@ -34,6 +34,7 @@ def test_files_are_written_read_listed_and_removed(root: Place) -> None:
     assert (root / "a/x.json").exists() and not (root / "a/z.json").exists()
     assert (root / "a/y.json").read() == b"22"
     assert [one.name for one in root.below()] == ["a", "b.txt"]
+    assert root.entries() == {root / "a": True, root / "b.txt": False}
     assert [(one.name, one.read()) for one in (root / "a/*.json").matches()] == [
         ("x.json", b"1"),
         ("y.json", b"22"),

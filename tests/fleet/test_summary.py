@@ -204,6 +204,19 @@ def test_a_vehicle_whose_drives_all_leave_a_direction_open_is_unobservable(tmp_p
     assert outcome(6, 3) == ("ok", "")
 
 
+def test_charts_of_many_drives_stay_small_and_show_their_change(tmp_path: Path) -> None:
+    """60 vehicles with charts of 130 kB and 5,000 drives in the table are a page of 10 MB."""
+    drives = [drive(f"a{k:03d}", "v", f"2026-01-01T{k // 4:02d}:{k % 4}0:00+00:00") for k in range(80)]
+    records = {one.name: done(one.name, result(k, knock=0.06 * (k >= 33))) for k, one in enumerate(drives)}
+    write_summary(drives, records, Place.of(tmp_path), BatchConfig())
+    page = (tmp_path / "summary.html").read_text()
+    charts = page[page.index('id="drift"') : page.index('id="drives"')]
+    assert len(charts) < 130_000
+    titles = re.findall(r"<title>(a\d+)</title>", charts)
+    assert {"a000", "a032", "a033", "a079"} <= set(titles)
+    assert len(set(titles)) <= summary_page.MOST_IN_A_CHART + 2 and len(titles) == 7 * len(set(titles))
+
+
 def test_drives_of_earlier_runs_that_are_not_given_are_told(tmp_path: Path) -> None:
     for name in ("x", "y", "z"):
         (tmp_path / "drives" / name).mkdir(parents=True)

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import shlex
-import subprocess
 from contextlib import ExitStack
-from pathlib import Path
 
-import sst_graph
 from sst_graph.cli.inputs import settings
 from sst_graph.cli.messages import mention, say
 from sst_graph.cli.output_places import check_apart
@@ -17,14 +15,18 @@ from sst_graph.errors import ConfigError
 from sst_graph.experiments.paper.config import PaperTableConfig
 from sst_graph.experiments.paper.tables import STATE, PaperTable
 from sst_graph.experiments.registry import experiment
+from sst_graph.experiments.tasks.code_version import code_version
 from sst_graph.files import output_file
+
+RECORDS_NAME = "{}.runs.jsonl"
+"""File of what is done in the folder of --out, by the experiment's name."""
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the experiment ``args.name``; its Markdown goes to ``args.out``, or to the terminal.
 
     Its last line tells the command and the version of the code. Tables of the paper have further files beside
-    ``args.out``.
+    ``args.out``; so have experiments that keep what is done, where their setting ``records`` names no file.
     """
     chosen = experiment(args.name)
     methods = None if args.methods is None else [m.strip() for m in args.methods.split(",") if m.strip()]
@@ -36,7 +38,12 @@ def run(args: argparse.Namespace) -> int:
     config = settings(chosen.config, args, flags)
     if chosen.table is not None and args.out is not None:
         return _write_table(chosen.table, config, args)
-    check_apart({"--config": args.config}, {"--out": args.out})
+    outputs_by_name = {"--out": args.out}
+    if args.out is not None and getattr(config, "records", None) == "":
+        records = args.out.parent / RECORDS_NAME.format(args.name)
+        config = dataclasses.replace(config, records=str(records))
+        outputs_by_name["the file of runs"] = records
+    check_apart({"--config": args.config}, outputs_by_name)
     with ExitStack() as outputs:
         out = None if args.out is None else outputs.enter_context(output_file(args.out, args.overwrite))
         with ProgressBar() as progress:
@@ -74,19 +81,3 @@ def _origin(args: argparse.Namespace) -> str:
     data = ["--data", *args.data] if args.data else []
     command = shlex.join(["sst-graph", "experiment", args.name, *data, *words])
     return f"\nMade by `{command}`, sst-graph {code_version()}.\n"
-
-
-def code_version() -> str:
-    """The commit where the code runs from a checkout, which may differ from what is installed; else the
-    version of the package."""
-    package = str(sst_graph.__version__)
-    root = Path(sst_graph.__file__).parent.parent
-    if not (root / ".git").exists():
-        return package
-    # "-dirty": the code differs from that commit.
-    command = ["git", "-C", str(root), "describe", "--always", "--tags", "--dirty"]
-    try:
-        found = subprocess.run(command, capture_output=True, text=True, timeout=10.0, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return package
-    return f"commit {found.stdout.strip()}"

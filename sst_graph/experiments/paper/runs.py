@@ -11,14 +11,13 @@ from typing import Any
 import gtsam
 import numpy as np
 
-import sst_graph
 from sst_graph.batch import CalibrationConfig, calibrate_prepared
 from sst_graph.config import to_dict
 from sst_graph.drive.preparation import Drive, prepare_drive
 from sst_graph.experiments.paper.config import START, VARIANTS, PaperTableConfig
 from sst_graph.experiments.paper.drives import TableDrive
-from sst_graph.experiments.resumable import digest
 from sst_graph.experiments.starts import start_near, truth_of
+from sst_graph.experiments.tasks.resumable import digest
 from sst_graph.metrics import calibration_errors
 from sst_graph.odometry.sweep import with_sweep
 from sst_graph.types import GroundTruth, Source
@@ -44,20 +43,14 @@ class Case:
         return self.drive.name
 
     def key(self, config: PaperTableConfig) -> str:
-        """Digest of all that its result depends on: settings of drive, start and method, and the version."""
+        """Digest of all that its result depends on beside the code: settings of drive, start and method."""
         if self.drive.street is None:
             data: Any = [str(Path(self.drive.path).resolve()), self.drive.sequence, self.drive.frames]
         else:
             data = to_dict(config.street(self.drive.street, self.images_late))
         start = [self.drive.seed, self.start, config.start_deg, config.start_m]
         how = None if self.method == START else to_dict(config.calibration_of(self.method))
-        parts = {
-            "data": data,
-            "images_late": self.images_late,
-            "start": start,
-            "method": how,
-            "version": sst_graph.__version__,
-        }
+        parts = {"data": data, "images_late": self.images_late, "start": start, "method": how}
         return digest(parts)
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sst_graph.errors import count_of
+from sst_graph.experiments.basin import binomial_bounds
 from sst_graph.experiments.markdown import NONE, median, table
 from sst_graph.experiments.paper.config import START, VARIANTS, PaperTableConfig
 from sst_graph.experiments.paper.runs import Run
@@ -102,7 +103,8 @@ def _conditions(layout: Layout, config: PaperTableConfig) -> str:
     )
     return (
         f"{drives}, within ±{config.start_deg:g}° and ±{100 * config.start_m:g} cm by axis. Failed: no "
-        f"estimate, QAD above {config.failed_deg:g}° or ATD above {100 * config.failed_m:g} cm; flagged: its "
+        f"estimate, QAD above {config.failed_deg:g}° or ATD above {100 * config.failed_m:g} cm, in brackets "
+        "the exact 95 % bounds of its probability (Clopper–Pearson); flagged: its "
         "status is not ok. Figures are mean / median of the runs that did not fail; QAD has the median of "
         f"all in a column of its own.{time if layout.with_time else ''} {OURS}"
     )
@@ -117,7 +119,7 @@ def _row(own: Sequence[Run], layout: Layout, config: PaperTableConfig) -> list[s
     flagged = sum(run.status != "ok" for run in bad)
     cells = [
         method,
-        f"{len(bad)} of {len(own)}" + (f" ({empty} without an estimate)" if empty else ""),
+        _failures(len(bad), len(own), empty),
         f"{flagged} of {len(bad)}" if bad and method != START else NONE,
         median([run.qad_deg for run in own], 2),
         _mean_median([run.qad_deg for run in good], 2),
@@ -134,6 +136,12 @@ def _row(own: Sequence[Run], layout: Layout, config: PaperTableConfig) -> list[s
         cells.append(_mean_median(_absolute([run.true_error_ms for run in good]), 1))
         cells.append(_mean_median(_absolute([run.nominal_error_ms(config) for run in good]), 1))
     return cells
+
+
+def _failures(count: int, of: int, empty: int) -> str:
+    """Failed runs of all, the bounds of their probability, and how many found nothing."""
+    low, high = (100.0 * bound for bound in binomial_bounds(count, of))
+    return f"{count} of {of} ({low:.0f}–{high:.0f} %{f'; {empty} without an estimate' if empty else ''})"
 
 
 def _printed_row(row: Printed, layout: Layout) -> list[str]:

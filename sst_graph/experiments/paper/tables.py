@@ -13,7 +13,7 @@ from sst_graph.experiments.paper.drives import table_drives
 from sst_graph.experiments.paper.plot import check_plot, plot_svg
 from sst_graph.experiments.paper.runs import Case, Run, cases_of, runs_of
 from sst_graph.experiments.paper.summary import Layout, Printed, csv_text, markdown
-from sst_graph.experiments.resumable import Work, rows_of
+from sst_graph.experiments.tasks.resumable import Work, rows_of
 
 STATE = "paper-tables.runs.jsonl"
 """File of runs in the folder of --out; the four tables share it, for some of their runs are the same."""

@@ -44,7 +44,8 @@ class PeersConfig(Settings):
         samples: poses of each round of CalibAnything's random search; the original leaves it to its user.
         failed_deg, failed_m: rotation (QAD) or translation (ATD) beyond which a run has failed.
         jobs: drives at a time, a process each.
-        records: file that keeps finished tasks, from which a further call goes on.
+        records: file that keeps finished tasks, from which a further call of the same code goes on; empty:
+            one beside --out.
         figure: SVG to write, of error against start.
         street: the rest of the streets.
         calibration: settings of the package's methods.

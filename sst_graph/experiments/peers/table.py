@@ -12,7 +12,7 @@ from sst_graph.drive.preparation import Progress
 from sst_graph.experiments.markdown import NONE, median, table
 from sst_graph.experiments.peers.methods import OWN, PEERS
 from sst_graph.experiments.peers.runs import START, PeerRun, PeersConfig, runs_of, tasks_of
-from sst_graph.experiments.resumable import Work, rows_of
+from sst_graph.experiments.tasks.resumable import Work, rows_of
 from sst_graph.files import atomic_write_bytes
 from sst_graph.viz.matplotlib_figure import figure_class
 

@@ -18,11 +18,14 @@ from sst_graph.inspect.inspection import HUMAN
 from sst_graph.inspect.reasons import cut
 from sst_graph.report.chart import Chart
 from sst_graph.report.html import bullets, details, figure, grid, packaged, page, paragraph, section, text
+from sst_graph.types import IntArray
 
 MOST_ROWS = 5000
 """Drives on the page; the tables have all of them. Those that need attention come first."""
 MOST_CHARTS = 60
 """Vehicles with charts of their drift, those that need attention first."""
+MOST_IN_A_CHART = 25
+"""Drives of a vehicle in its charts, evenly over each stretch between two changes; each takes 4 kB."""
 _SIGMA_HEADS = ("σ rotation", "σ translation", "σ time offset")
 _SHOWN = ("drive", "vehicle", "date", "status", "reason", *_SIGMA_HEADS, "took")
 
@@ -237,6 +240,11 @@ def _drifts(vehicles: Sequence[Vehicle]) -> str:
         "the LiDAR's axes; the bands are one σ. A line ends where the calibration changed. Errors that all "
         "drives have in common do not show."
     )
+    if any(len(one.drives) > MOST_IN_A_CHART for one in moving):
+        note += (
+            f" Of many drives about {MOST_IN_A_CHART} are shown, with those on either side of a change; "
+            "vehicles/NAME.json has all."
+        )
     return section("drift", "Drift", paragraph(note, "note"), *blocks) if blocks else ""
 
 
@@ -250,9 +258,10 @@ def _charts(vehicle: Vehicle) -> list[str]:
     )
     human = steps * HUMAN
     sigmas = np.sqrt([np.diag(one.covariance) for one in vehicle.drift]) * HUMAN
+    stretches = _stretches(vehicle)
+    marked = np.concatenate(stretches)
     span = (float(days[0]), float(days[-1]))
     unit = "days" if vehicle.dated else "drives"
-    stretches = _stretches(vehicle)
     shown = []
     for title, columns, label in (
         ("Rotation", [0, 1, 2], "deg"),
@@ -275,12 +284,18 @@ def _charts(vehicle: Vehicle) -> list[str]:
                 else:  # a band of no width would not show
                     chart.line([*at, *at], [*(middle - wide), *(middle + wide)], colour)
                 chart.line(at, middle, colour, name if number == 0 else "")
-            chart.dots(days, values[:, k], colour, titles=vehicle.drives)
+            chart.dots(days[marked], values[marked, k], colour, titles=[vehicle.drives[n] for n in marked])
         shown.append(figure(chart.svg(), title, ""))
     return shown
 
 
-def _stretches(vehicle: Vehicle) -> list[slice]:
-    """The drives between its changes."""
-    begins = [0, *(vehicle.drives.index(change.before) for change in vehicle.changes), len(vehicle.drives)]
-    return [slice(first, end) for first, end in pairwise(begins)]
+def _stretches(vehicle: Vehicle) -> list[IntArray]:
+    """Numbers of the drives between its changes that are shown; of many some, first and last among them."""
+    total = len(vehicle.drives)
+    begins = [0, *(vehicle.drives.index(change.before) for change in vehicle.changes), total]
+    share = min(1.0, MOST_IN_A_CHART / total)
+    found = []
+    for first, end in pairwise(begins):
+        count = max(min(2, end - first), round(share * (end - first)))
+        found.append(np.linspace(first, end - 1, count).round().astype(np.intp))
+    return found

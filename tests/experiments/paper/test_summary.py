@@ -70,12 +70,12 @@ def test_failures_are_counted_and_left_out_of_the_means() -> None:
     rows = cells(markdown(RUNS, TABLES["table3"].layout, CONFIG))
     late = "1: 103.6 / 100"
     assert rows["joint"] == [
-        *(late, "0 of 3", "–", "0.20", "0.30 / 0.20", "0.15 / 0.10", "3.0 / 2.0"),
+        *(late, "0 of 3 (0–71 %)", "–", "0.20", "0.30 / 0.20", "0.15 / 0.10", "3.0 / 2.0"),
         *("105.6", "3.0 / 2.0", "6.6 / 5.6"),
     ]
-    assert rows["paper"][:5] == [late, "2 of 3", "1 of 2", "20.00", "1.00 / 1.00"]
+    assert rows["paper"][:5] == [late, "2 of 3 (9–99 %)", "1 of 2", "20.00", "1.00 / 1.00"]
     assert rows["paper"][-3:] == ["83.6", "20.0 / 20.0", "16.4 / 16.4"]
-    assert rows["start"][1:4] == ["3 of 3", "–", "9.00"] and set(rows["start"][4:]) == {"–"}
+    assert rows["start"][1:4] == ["3 of 3 (29–100 %)", "–", "9.00"] and set(rows["start"][4:]) == {"–"}
     assert rows["*printed:* SST-Calib, joint stage"][4:] == [
         "0.67 / 0.66",
         "–",
@@ -88,7 +88,7 @@ def test_failures_are_counted_and_left_out_of_the_means() -> None:
 
 def test_a_table_without_time_offsets_has_no_such_columns() -> None:
     rows = cells(markdown(RUNS, TABLES["table1"].layout, CONFIG))
-    assert rows["joint"] == ["0 of 3", "–", "0.20", "0.30 / 0.20", "0.15 / 0.10", "3.0 / 2.0"]
+    assert rows["joint"] == ["0 of 3 (0–71 %)", "–", "0.20", "0.30 / 0.20", "0.15 / 0.10", "3.0 / 2.0"]
     assert {len(row) for row in rows.values()} == {6}
 
 

@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 
 from sst_graph.cli import main
-from sst_graph.cli.commands.experiment import code_version
 from sst_graph.experiments.paper.tables import STATE
+from sst_graph.experiments.tasks.code_version import code_version
 
 PROGRAM = [sys.executable, "-m", "sst_graph", "experiment"]
 DRIVES = Path(__file__).resolve().parents[4] / "shared" / "data"
@@ -44,8 +44,8 @@ def test_a_kitti_root_gives_the_stretch_of_sequence_00(
     table, rows = out.read_text(), rows_of(out.with_suffix(".csv"))
     assert "\nkitti/00, frames 1 to 3\n" in table and "ours" in table
     # stamps 0.1, 0.2, 0.31, 0.41 s
-    assert "| 0: 0.0 / 0 | 1 of 1 (1 without an estimate) |" in table
-    assert "| joint | 1: 103.3 / 100 | 1 of 1 (1 without an estimate) | 1 of 1 |" in table
+    assert "| 0: 0.0 / 0 | 1 of 1 (3–100 %; 1 without an estimate) |" in table
+    assert "| joint | 1: 103.3 / 100 | 1 of 1 (3–100 %; 1 without an estimate) | 1 of 1 |" in table
     assert [(row["images_late"], row["method"]) for row in rows] == [
         *(("0", "start"), ("0", "joint"), ("1", "start"), ("1", "joint"))
     ]

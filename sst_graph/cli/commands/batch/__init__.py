@@ -10,7 +10,7 @@ from typing import Any
 
 from sst_graph.cli import EXIT_NOT_TRUSTED
 from sst_graph.cli.commands.batch.ending import children_ended
-from sst_graph.cli.commands.batch.progress import ProgressOnStderr
+from sst_graph.cli.commands.batch.progress import ProgressOnStderr, on_terminal
 from sst_graph.cli.inputs import calibration_settings
 from sst_graph.cli.messages import complain, mention
 from sst_graph.cli.options import SOURCE_DEFAULTS
@@ -30,6 +30,7 @@ from sst_graph.fleet import (
     with_vehicles,
     write_summary,
 )
+from sst_graph.fleet.drives import loose_files
 from sst_graph.fleet.summary.page import counts_line, others_line
 from sst_graph.reference import load_initial
 
@@ -44,11 +45,12 @@ def run(args: argparse.Namespace) -> int:
     out = Place(os.path.abspath(out.url)) if out.is_local else out
     drives = _but(out, find_drives(args.drives, _at_least("--name-parts", args.name_parts, 1)))
     _say_if_a_drive(args.drives, drives)
+    _say_loose(args.drives)
     if args.vehicle_from is not None:
         drives = with_vehicles(drives, args.vehicle_from)
         _say_without_vehicle(drives)
     _check_apart(drives, out)
-    with open_batch(out, config.options), children_ended(), ProgressOnStderr() as told:
+    with open_batch(out, config.options), children_ended(out), ProgressOnStderr() as told:
         records = run_batch(drives, out, config, told)
         told.close()
         outcome = write_summary(drives, records, out, config)
@@ -151,18 +153,31 @@ def _say_if_a_drive(what: str, drives: list[Drive]) -> None:
         )
 
 
+def _say_loose(what: str) -> None:
+    """Name the files beside the drives that are taken for none."""
+    names = loose_files(what)
+    if names:
+        complain(
+            f"note: {what}: {count_of(len(names), 'file')} left out: {_some(names)} (a folder or a bag is a "
+            "drive; a pattern or a list may name others)"
+        )
+
+
 def _say_without_vehicle(drives: list[Drive]) -> None:
     without = [drive.name for drive in drives if not drive.vehicle]
     if without:
-        some = ", ".join(without[:_MOST_SAID]) + (", ..." if len(without) > _MOST_SAID else "")
-        complain(f"note: no vehicle is known of {count_of(len(without), 'drive')}: {some}")
+        complain(f"note: no vehicle is known of {count_of(len(without), 'drive')}: {_some(without)}")
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:_MOST_SAID]) + (", ..." if len(names) > _MOST_SAID else "")
 
 
 def _say(outcome: Outcome, out: Place) -> None:
     mention(f"{'drives':<15} {len(outcome.rows)}: {counts_line(outcome.rows)}")
     wrong = [row for row in outcome.rows if not row["report"]]
     for row in wrong[:_MOST_SAID]:
-        mention(f"{row['status']!s:<15} {row['drive']}: {row['reason']}")
+        mention(f"{row['status']!s:<15} {row['drive']}: {on_terminal(str(row['drive']), str(row['reason']))}")
     if len(wrong) > _MOST_SAID:
         mention(f"{'':<15} and {len(wrong) - _MOST_SAID} more without result")
     for vehicle in [one for one in outcome.vehicles if one.status != "ok"][:_MOST_SAID]:

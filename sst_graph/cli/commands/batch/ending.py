@@ -9,12 +9,15 @@ from contextlib import contextmanager
 from types import FrameType
 
 from sst_graph.cli.messages import complain
+from sst_graph.fleet import Place
+from sst_graph.fleet.attempt import remove_unfinished
 from sst_graph.fleet.isolated import end_all
 
 
 @contextmanager
-def children_ended() -> Iterator[None]:
-    """What ends this process ends those of its drives first; so does an error."""
+def children_ended(out: Place) -> Iterator[None]:
+    """What ends this process ends those of its drives first, and removes what they left unfinished in the
+    batch's folder; so does an error."""
     former = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
 
     def end(number: int, frame: FrameType | None) -> None:
@@ -22,6 +25,7 @@ def children_ended() -> Iterator[None]:
             signal.signal(one, signal.SIG_IGN)
         complain("ending the drives that run; the same command goes on from here")
         end_all()
+        remove_unfinished(out)
         before = former[signal.Signals(number)]
         if callable(before):
             before(number, frame)
@@ -35,6 +39,7 @@ def children_ended() -> Iterator[None]:
         yield
     except BaseException:
         end_all()
+        remove_unfinished(out)
         raise
     finally:
         for number, before in former.items():

@@ -10,6 +10,8 @@ from tqdm import tqdm
 from sst_graph.cli.messages import complain
 from sst_graph.errors import count_of
 from sst_graph.fleet import Progress
+from sst_graph.fleet.attempt import RECORDS
+from sst_graph.inspect.reasons import MOST_LETTERS, cut
 
 _LINE_EVERY_S = 30.0
 """Between lines of progress where no person watches."""
@@ -39,7 +41,8 @@ class ProgressOnStderr:
         if progress.last is not None and not progress.last.has_result:
             if self._bar is not None:
                 self._bar.clear()
-            complain(f"{progress.last.drive}: {progress.last.status}: {progress.last.reason}")
+            last = progress.last
+            complain(f"{last.drive}: {last.status}: {on_terminal(last.drive, last.reason)}")
 
     def _draw(self, progress: Progress) -> None:
         if self._bar is None:
@@ -54,6 +57,14 @@ class ProgressOnStderr:
         if self._bar is not None:
             self._bar.close()
             self._bar = None
+
+
+def on_terminal(drive: str, reason: str) -> str:
+    """Why a drive has no result, in two lines of a terminal: of a long reason what was found, and where all
+    of it stands."""
+    if len(reason) <= MOST_LETTERS:
+        return reason
+    return f"{cut(reason.split(', expected ')[0], MOST_LETTERS)} (more in {RECORDS}/{drive}.json)"
 
 
 def first_line(progress: Progress) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import logging
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -10,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from sst_graph.errors import ConfigError, DataError, EstimationError, SstGraphError
-from sst_graph.experiments.resumable import Work, rows_of
+from sst_graph.experiments.tasks import resumable
+from sst_graph.experiments.tasks.resumable import Work, rows_of
 
 RUNS: list[int] = []
 
@@ -50,6 +53,36 @@ def test_only_what_is_not_done_is_run(tmp_path: Path) -> None:
     assert run(path, 2, 3) == [Row(4.0, "2"), Row(9.0, "3")]
     assert run(path, 3, 4, 2)[1] == Row(16.0, "4")
     assert RUNS == [2, 3, 4]
+
+
+def test_what_another_version_of_the_code_did_is_done_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A table names one version; rows of another may have other fields."""
+    RUNS.clear()
+    path = tmp_path / "records"
+    monkeypatch.setattr(resumable, "recorded_version", lambda: "commit a")
+    run(path, 2, 3, 4)
+    path.write_text(path.read_text().replace('"value": 4.0', '"older": 4.0'))
+    monkeypatch.setattr(resumable, "recorded_version", lambda: "commit b")
+    with caplog.at_level(logging.WARNING):
+        assert run(path, 2, 3) == [Row(4.0, "2"), Row(9.0, "3")]
+    assert RUNS == [2, 3, 4, 2, 3]
+    (record,) = caplog.records
+    assert record.getMessage() == f"{path}: 2 runs of another version of the code, made again"
+    caplog.clear()
+    assert len(run(path, 2, 3)) == 2 and len(RUNS) == 5 and not caplog.records
+
+
+def test_records_that_name_no_version_do_not_count(tmp_path: Path) -> None:
+    RUNS.clear()
+    path = tmp_path / "records"
+    run(path, 2)
+    head, line = path.read_text().splitlines()
+    record = json.loads(line)
+    del record["version"]
+    path.write_text(f"{head}\n{json.dumps(record)}\n")
+    assert run(path, 2) == [Row(4.0, "2")] and RUNS == [2, 2]
 
 
 @pytest.mark.parametrize("left", [1, 20])

@@ -1,0 +1,1 @@
+"""Tasks of an experiment: in processes, resumable, each with the version of the code that did it."""
