@@ -91,11 +91,15 @@ left.hist(fit.points.residuals_px, bins=np.arange(-8, 8.1, 0.5))
 left.axvspan(-1.5, 1.5, color="tab:green", alpha=0.15, label="within 1.5 px")
 left.set(xlabel="distance to the outline [px]", ylabel="boundary points", title="at the result")
 left.legend()
-turned = [np.degrees(result.T_camera_lidar.localCoordinates(step.cTl)[:3]) for step in fit.iterations]
+places = [result.initial, *(step.cTl for step in fit.iterations)]
+turned = [np.degrees(result.T_camera_lidar.localCoordinates(place)[:3]) for place in places]
 right.plot(np.linalg.norm(turned, axis=1), "o-", label="rotation from the result [deg]")
-right.plot([step.kernel_px / 10.0 for step in fit.iterations], "--", label="robust kernel [10 px]")
+kernels = [step.kernel_px / 10.0 for step in fit.iterations]
+right.plot(range(1, len(kernels) + 1), kernels, "--", label="robust kernel [10 px]")
 right.set(
-    xlabel="outer iteration (matched again)", ylabel="rotation [deg], kernel [10 px]", title="convergence"
+    xlabel="outer iteration (0: the start; matched again)",
+    ylabel="rotation [deg], kernel [10 px]",
+    title="convergence",
 )
 right.legend()
 figure.tight_layout()

@@ -113,7 +113,7 @@ above.step(
 above.set(ylabel="turn of the camera [deg]")
 tested = [update for update in updates if update.chi2 is not None]
 below.semilogy(
-    [update.frame for update in tested], [update.chi2 for update in tested], "o-", label="statistic"
+    [update.frame for update in tested], [update.chi2 for update in tested], "o", label="statistic"
 )
 below.axhline(tracker.setup.config.alarm.chi2, color="gray", linestyle="--", label="threshold")
 below.set(xlabel="frame", ylabel="chi2 over its usual size [-]")

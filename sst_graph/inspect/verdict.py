@@ -46,12 +46,15 @@ def verdict(result: CalibrationResult) -> str:
     return f"Good to {_known(result)}"
 
 
-def quality_line(quality: FitQuality, result: CalibrationResult) -> str:
-    """Shares of close points of a result, as a line for a terminal."""
+def quality_line(quality: FitQuality, with_attainable: bool = True) -> str:
+    """Shares of close points, as a line for a terminal.
+
+    Args:
+        with_attainable: whether to say what such labels allow.
+    """
     by_labels = quality.by_chance is None
-    # What a wrong calibration allows tells nothing: it meets few contours, and those by chance. What edges
-    # allow falls with the calibration itself.
-    compared = by_labels and result.status != "not_converged"
+    # What edges allow falls with the calibration itself: it would not tell one that is wrong.
+    compared = by_labels and with_attainable
     others = {"at the start": quality.share_at_start, "at random rotations": quality.by_chance}
     shares = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in others.items() if share is not None)
     return (
@@ -67,14 +70,16 @@ def fit_line(result: CalibrationResult) -> str:
     quality = FitQuality.from_diagnostics(result.diagnostics)
     if quality is None:
         return edges_line(result)
+    # A wrong calibration meets few contours, and those by chance: what they allow is met as well.
+    compared = result.status != "not_converged"
     of_edges = FitQuality.from_diagnostics(result.diagnostics, EDGES_QUALITY)
     if of_edges is not None:
-        by_labels, by_edges = quality_line(quality, result), quality_line(of_edges, result)
+        by_labels, by_edges = quality_line(quality, compared), quality_line(of_edges)
         return f"labels: {by_labels}; edges in frames without labels: {by_edges}"
     if result.fit_is_check:
-        return f"{CHECK_BY_EDGES}: {quality_line(quality, result)}"
+        return f"{CHECK_BY_EDGES}: {quality_line(quality)}"
     contrast = "" if quality.by_chance is None else edges_line(result)
-    return "; ".join(line for line in (contrast, quality_line(quality, result)) if line)
+    return "; ".join(line for line in (contrast, quality_line(quality, compared)) if line)
 
 
 def edges_line(result: CalibrationResult) -> str:

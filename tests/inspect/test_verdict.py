@@ -142,6 +142,13 @@ def test_quality_in_one_line() -> None:
     )
 
 
+def test_what_labels_allow_is_not_said_of_a_calibration_that_contradicts_them() -> None:
+    stored = {"fit_quality": FitQuality(1338, 0.23, None, 0.24).to_dict()}
+    assert fit_line(_result([0.01] * 7, diagnostics=stored)).endswith("labels like these allow 24 %")
+    wrong = fit_line(_result([0.01] * 7, status="not_converged", diagnostics=stored))
+    assert wrong == "23 % of 1338 boundary points within 1.5 px of the contour"
+
+
 def test_without_labels_the_fit_is_how_far_the_edges_stand_out() -> None:
     contrast = {"score": 120.0, "sigmas": 18.95, "ratio": 7.0, "other": 0.0}
     expected = {"least_sigmas": 6.0, "least_over_other": 1.08}
