@@ -274,9 +274,9 @@ def _words(
             f"about {_rotation_axis(rotation)}",
             advice.rotation,
         )
+    cm = 100.0 * float(np.linalg.norm(alone[3:6]))
     return (
-        f"the translation is known to {100 * np.linalg.norm(alone[3:6]):.1f} cm only (one sigma), "
-        f"{either_way}",
+        f"the translation is known to {cm:.1f} cm only (one sigma), {either_way}",
         advice.translation,
     )
 

@@ -26,8 +26,8 @@ _PLACES = 3
 """Places across and down the picture, its borders among them: the worst of them stands for the corners."""
 _MORE_IN_CORNERS = 1.5
 """The corners have a figure of their own where it is so many times that of the middle."""
-_LENS_COUNTS = 1.2
-"""The lens counts where it makes the corners' figure so many times that by the calibration alone."""
+LENS_COUNTS = 1.2
+"""The lens counts where with it an error is so many times that by the calibration alone."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Misfit:
     @property
     def lens_counts(self) -> bool:
         """Whether the lens makes the corners clearly worse than the calibration alone does."""
-        return self.corner_px >= _LENS_COUNTS * self.corner_pose_px
+        return self.corner_px >= LENS_COUNTS * self.corner_pose_px
 
 
 def misfits(result: CalibrationResult) -> tuple[Misfit, ...]:

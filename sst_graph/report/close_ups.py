@@ -15,10 +15,11 @@ from sst_graph.factors import residuals
 from sst_graph.factors.matches import Alignment
 from sst_graph.features.mask_contour import ContourMap
 from sst_graph.fit import CLOSE_PX, Fit, PointResiduals
+from sst_graph.inspect.misfit import LENS_COUNTS
 from sst_graph.inspect.pixels import covariance_of_given_lens, drawn_covariance
 from sst_graph.report.drawn_frame import DrawnFrame, DriveReader
 from sst_graph.report.html import jpeg, text
-from sst_graph.report.overlay import Placements, project_points
+from sst_graph.report.overlay import CLASS_NAMES, Placements, project_points
 from sst_graph.result import CalibrationResult
 from sst_graph.types import FloatArray, IntArray, SemanticClass
 
@@ -46,8 +47,6 @@ _WHITE, _MOST_GAIN = 230.0, 3.0
 """Grey level of what is bright, and most that contrast is raised: more would show noise."""
 _EDGE_PX = 0.8
 """Half the length at which an edge of the picture is drawn [px]."""
-_LENS_COUNTS = 1.2
-"""The caption names what the lens adds where the move is then so many times as large."""
 _SIDE_NAMES = ("left", "right", "top", "bottom")
 
 
@@ -163,7 +162,7 @@ def _close_up(
     moves = _two_sigma_moves(A, covariance_of_given_lens(result))
     crop = _Crop.around(uvs, _leverages(points, result.covariance), drawn.image.pixels)
     picture = crop.enlarged(drawn.image.pixels)
-    class_name = SemanticClass(int(points.classes[0])).name.lower().replace("_", " ")
+    class_name = CLASS_NAMES[SemanticClass(int(points.classes[0]))]
     r = points.residuals_px
     size = float(np.median(np.abs(r)))
     reach = float(np.median(np.linalg.norm(moves, axis=1)))
@@ -263,7 +262,7 @@ def _by_lens(
         for lP, uv, J in zip(points.lPs, uvs, A, strict=True)
     ]
     both_px = 2.0 * float(np.sqrt(max(0.0, np.median(largest))))
-    if both_px < _LENS_COUNTS * reach_px:
+    if both_px < LENS_COUNTS * reach_px:
         return ""
     return f", or by ±{both_px:.1f} px where the lens is off, too, as far as is assumed"
 

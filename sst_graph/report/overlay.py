@@ -25,7 +25,7 @@ _HIDDEN = 65535
 _NO_RESIDUAL = -128
 _RESIDUAL_STEPS = 8.0
 """Residuals are stored in steps of 1/8 px, up to 15.9 px."""
-_NAMES = {c: c.name.lower().replace("_", " ") for c in SemanticClass}
+CLASS_NAMES = {c: c.name.lower().replace("_", " ") for c in SemanticClass}
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def overlay(drawn: DrawnFrame, placements: Placements, points: PointResiduals | 
         "residualBefore": packed(_steps(before_px)),
         "residual": packed(_steps(after_px)),
         "contours": _contours(drawn, classes_of(points), scale),
-        "classes": {str(int(c)): _NAMES[c] for c in sorted(SemanticClass(int(c)) for c in of_cloud)},
+        "classes": {str(int(c)): CLASS_NAMES[c] for c in sorted(SemanticClass(int(c)) for c in of_cloud)},
         "edge": edge_name,
     }
     frame = drawn.frame

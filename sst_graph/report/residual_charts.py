@@ -9,6 +9,7 @@ from sst_graph.factors.camera import PinholeCamera
 from sst_graph.fit import CLOSE_PX, Fit, PointResiduals
 from sst_graph.report.chart import BROAD, Chart
 from sst_graph.report.html import figure, numbered
+from sst_graph.report.overlay import CLASS_NAMES
 from sst_graph.types import FloatArray, IntArray, SemanticClass
 
 _MOST_OBJECTS = 30
@@ -175,7 +176,7 @@ def _name(points: PointResiduals) -> str:
     lP = np.median(points.lPs, axis=0)
     azimuth = round(float(np.degrees(np.arctan2(lP[1], lP[0]))))
     side = f"{abs(azimuth)}° {'left' if azimuth > 0 else 'right'}" if azimuth else "ahead"
-    class_name = SemanticClass(int(points.classes[0])).name.lower().replace("_", " ")
+    class_name = CLASS_NAMES[SemanticClass(int(points.classes[0]))]
     frames = count_of(len(np.unique(points.frames)), "frame")
     return (
         f"{class_name} at {np.median(np.linalg.norm(points.lPs, axis=1)):.0f} m, {side}, "

@@ -52,22 +52,16 @@ def test_work_over_two_seconds_has_lines(clock: list[float], capsys: pytest.Capt
 
 
 @pytest.mark.usefixtures("lines")
-def test_short_stages_count_together(clock: list[float], capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(("stages", "seconds", "told"), [(20, 1.0, (1, 11)), (3, 0.6, ())])
+def test_short_stages_count_together(
+    stages: int, seconds: float, told: tuple[int, ...], clock: list[float], capsys: pytest.CaptureFixture[str]
+) -> None:
     with ProgressBar() as progress:
-        for k in range(20):
-            clock[0] += 1.0
+        for k in range(stages):
+            clock[0] += seconds
             progress(f"stage {k}", 1, 1)
     said = capsys.readouterr().err.splitlines()
-    assert said == [f"sst-graph: progress: stage {k}: 1 of 1 (100 %)" for k in (1, 11)]
-
-
-@pytest.mark.usefixtures("lines")
-def test_short_work_is_silent(clock: list[float], capsys: pytest.CaptureFixture[str]) -> None:
-    with ProgressBar() as progress:
-        for k in range(3):
-            clock[0] += 0.6
-            progress(f"stage {k}", 1, 1)
-    assert capsys.readouterr().err == ""
+    assert said == [f"sst-graph: progress: stage {k}: 1 of 1 (100 %)" for k in told]
 
 
 def test_nothing_is_said_in_a_process_of_others(
