@@ -234,7 +234,7 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
         solution.state.time_offsets_s[0],
         total.covariance,
         frames_used(drives, solution),
-        (*_contradicted(tests, contradictions, wrong), *motion.reasons, *total.reasons),
+        (*_contradicted(tests, contradictions, wrong), *motion.reasons),
         (*motion.remarks, *total.remarks),
         assumed_motion(drives),
         motion.estimate.by_static_objects[:7, :7],
@@ -253,7 +253,7 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
         fit,
         matched=MatchedDrives(problem, solution.state),
         by_sweeps=total.by_sweeps,
-        sweep_reasons=total.reasons,
+        open_sweeps=total.reasons,
         assumption_steps=considered.steps(),
     )
 

@@ -74,7 +74,7 @@ class MethodEstimate:
         edges_fit: the same of edges in other frames, where ``fit`` is of labels.
         matched: what it was matched with, of methods that match.
         by_sweeps: (7, 7) part of the covariance by sweeps that the scans leave undecided.
-        sweep_reasons: those of the reasons that say that such sweeps matter.
+        open_sweeps: that such sweeps matter, which makes the status ``unobservable``.
         shared: errors that other cameras on the LiDAR have, too, of methods without ``solved``.
         assumption_steps: (7,) step of the estimate by one deviation of each assumption that is considered in
             the covariance, by name.
@@ -96,7 +96,7 @@ class MethodEstimate:
     edges_fit: Fit | None = None
     matched: MatchedDrives | None = None
     by_sweeps: FloatArray = field(default_factory=lambda: np.zeros((7, 7)))
-    sweep_reasons: tuple[str, ...] = ()
+    open_sweeps: tuple[str, ...] = ()
     shared: SharedErrors | None = None
     assumption_steps: Mapping[str, FloatArray] = field(default_factory=dict)
 
@@ -104,12 +104,12 @@ class MethodEstimate:
 def result_of(
     estimate: MethodEstimate, drives: Sequence[Drive], guess: Guess, config: CalibrationConfig
 ) -> CalibrationResult:
-    """The result: not_converged where there is a reason, unobservable where a direction exceeds the
-    limits."""
+    """The result: not_converged where there is a reason, unobservable where a direction exceeds the limits
+    or nothing decides a sweep that matters."""
     advice = MOTION if config.method == "motion" else SILHOUETTES
     weak = _weak_directions(estimate, config.observability, advice)
     wrong = (*estimate.reasons, *(_jumps(drives) if config.check_stamps else ()))
-    status: Status = "not_converged" if wrong else "unobservable" if weak else "ok"
+    status: Status = "not_converged" if wrong else "unobservable" if estimate.open_sweeps or weak else "ok"
     sentences = (direction.reason for direction in weak)
     qualities = quality_of(estimate.fit) | quality_of(estimate.edges_fit, EDGES_QUALITY)
     return CalibrationResult(
@@ -118,7 +118,7 @@ def result_of(
         covariance=estimate.covariance,
         status=status,
         camera=drives[0].camera,
-        reasons=(*wrong, *estimate.assumed, *sentences, *estimate.remarks),
+        reasons=(*wrong, *estimate.open_sweeps, *estimate.assumed, *sentences, *estimate.remarks),
         weak_directions=weak,
         frames_used=estimate.frames,
         drive_offsets=estimate.drive_offsets,

@@ -15,7 +15,7 @@ from sst_graph.cli.progress import ProgressBar, ProgressStage
 from sst_graph.data.frame_parts import RecentReader
 from sst_graph.files import OutputKind
 from sst_graph.inspect.inspection import inspect_result, to_dict
-from sst_graph.inspect.reasons import short_reasons
+from sst_graph.inspect.reasons import MOST_REASONS, short_reasons
 from sst_graph.inspect.report import OWN_CALIBRATION, Comparison, markdown_report
 from sst_graph.metrics import calibration_errors
 from sst_graph.odometry.sweep import with_sweep_of
@@ -110,7 +110,7 @@ def result_numbers(result: CalibrationResult, against: Comparison | None) -> dic
 def exit_code(result: CalibrationResult) -> int:
     """Exit code of a result; one line on stderr says why it is not to be trusted: the first reason.
 
-    The summary has a line for each, the report all of it.
+    The summary has a line for each of the first, the report all of it.
     """
     if result.status == "ok":
         return 0
@@ -121,7 +121,8 @@ def exit_code(result: CalibrationResult) -> int:
 def why_not_ok(result: CalibrationResult) -> str:
     """Status and first reason of a result that is not ok, in one line."""
     first, *others = short_reasons(result) or ("the result carries no reason",)
-    where = "in the report" if loudness.quiet else "in the summary; in full in the report"
+    in_summary = not loudness.quiet and len(others) < MOST_REASONS
+    where = "in the summary; in full in the report" if in_summary else "in the report"
     more = f" ({len(others)} more {where})" if others else ""
     return f"{result.status}: {first}{more}"
 

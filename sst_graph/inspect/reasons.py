@@ -12,6 +12,8 @@ from sst_graph.result import CalibrationResult
 
 MOST_LETTERS = 160
 """Letters of a short reason: two lines of a terminal."""
+MOST_REASONS = 5
+"""Reasons on a terminal: the first is the likely cause, and what follows mostly its consequences."""
 _PARENTHESES = re.compile(r" ?\([^()]*\)")
 _BREAK = re.compile(r":\s+")
 

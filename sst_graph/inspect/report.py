@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from sst_graph.inspect.budget_text import budget_lines, estimated_lines
-from sst_graph.inspect.reasons import short_reasons
+from sst_graph.inspect.reasons import MOST_REASONS, short_reasons
 from sst_graph.inspect.verdict import figure, fit_line, is_start, verdict
 from sst_graph.metrics import (
     CalibrationErrors,
@@ -103,7 +103,10 @@ def summary_rows(result: CalibrationResult, comparison: Comparison | None = None
         rows.append((f"{'start ' * is_start(result)}against {comparison.name}", ""))
         rows += [("", line) for line in error_lines(comparison.errors)]
     rows += [("fit", fit)] if (fit := fit_line(result)) else []
-    rows += [("reason", reason) for reason in short_reasons(result)]
+    reasons = short_reasons(result)
+    rows += [("reason", reason) for reason in reasons[:MOST_REASONS]]
+    if len(reasons) > MOST_REASONS:
+        rows.append(("", f"and {len(reasons) - MOST_REASONS} more: reasons in the result's file"))
     for weak in result.weak_directions:
         if not any(weak.sentence in reason for reason in result.reasons):
             rows += [("weak", weak.sentence), ("", weak.advice)]

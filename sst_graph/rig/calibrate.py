@@ -204,7 +204,12 @@ class _Camera:
     @property
     def trusted(self) -> bool:
         """Whether its own estimate may inform other cameras."""
-        return self.estimate is not None and self.result.status != "not_converged"
+        return self.estimate is not None and self.result.status != "not_converged" and not self.open_sweeps
+
+    @property
+    def open_sweeps(self) -> tuple[str, ...]:
+        """That nothing decides a sweep and that it matters: an error that all cameras share."""
+        return () if self.estimate is None else self.estimate.open_sweeps
 
     @cached_property
     def errors(self) -> CameraInfluences | SharedErrors | None:
@@ -444,12 +449,13 @@ def _camera_result(
     cTl, covariance = after.extrinsics[at], after.of_camera(name)
     weak = open_directions(covariance, static, cTl, config.observability)
     not_converged = bool(wrong) or own.status == "not_converged"
-    status: Status = "not_converged" if not_converged else "unobservable" if weak else "ok"
-    gone = {direction.reason for direction in own.weak_directions}
+    unobservable = bool(weak) or bool(camera.open_sweeps)
+    status: Status = "not_converged" if not_converged else "unobservable" if unobservable else "ok"
+    gone = {*(direction.reason for direction in own.weak_directions), *camera.open_sweeps}
     kept = tuple(reason for reason in own.reasons if reason not in gone)
     if not own.frames_used and status == "ok":
         kept = (_FROM_OTHERS, *kept)
-    sentences = tuple(direction.reason for direction in weak)
+    sentences = (*camera.open_sweeps, *(direction.reason for direction in weak))
     alone = {
         "T_camera_lidar": own.T_camera_lidar.matrix().tolist(),
         "time_offset_s": own.time_offset_s,

@@ -41,6 +41,7 @@ def tracker_result(tracker: Tracker, drive: str, camera_name: str) -> Calibratio
         reasons = (*last.contradictions, *reasons)
     elif last.status == "unconfirmed":
         reasons = tuple(filter(None, (*_unconfirmed(last, tracker.monitor), window.lacking_labels())))
+        status = "not_converged" if reasons else "unobservable"  # for an undecided sweep alone
     elif last.status != "ok":
         reasons = tuple(filter(None, (_NO_ESTIMATE[last.status], tracker.initializer.why)))
     if last.status != "ok":

@@ -292,5 +292,7 @@ def test_where_further_reasons_stand(monkeypatch: pytest.MonkeyPatch) -> None:
     """With --quiet there is no summary."""
     result = dataclasses.replace(turned(3), status="not_converged", reasons=("one", "two"))
     assert why_not_ok(result) == "not_converged: one (1 more in the summary; in full in the report)"
+    many = dataclasses.replace(result, reasons=tuple(f"reason {k}" for k in range(8)))
+    assert why_not_ok(many) == "not_converged: reason 0 (7 more in the report)"
     monkeypatch.setattr(loudness, "quiet", True)
     assert why_not_ok(result) == "not_converged: one (1 more in the report)"

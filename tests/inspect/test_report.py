@@ -42,6 +42,15 @@ def test_summary_carries_every_number_with_its_sigma() -> None:
     assert "1 m ahead equals 118 ms." in text and "Record a stop." in text
 
 
+def test_of_many_reasons_the_summary_has_the_first() -> None:
+    reasons = tuple(f"this is wrong {k}" for k in range(8))
+    text = summary(replace(RESULT, status="not_converged", reasons=reasons))
+    assert all(reason in text for reason in reasons[:5]) and "wrong 5" not in text
+    assert "and 3 more: reasons in the result's file" in text
+    text = summary(replace(RESULT, status="not_converged", reasons=reasons[:5]))
+    assert reasons[4] in text and " more" not in text
+
+
 def test_summary_names_each_drives_offset() -> None:
     text = summary(replace(RESULT, drive_offsets=(DriveOffset("a/00", -0.05, 0.001),)))
     assert "a/00: -50.00 ms +- 1.0 ms" in text

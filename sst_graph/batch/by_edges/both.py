@@ -91,16 +91,11 @@ def _fit_at(fused: State, part: MethodEstimate) -> Fit | None:
 
 
 def _usable(part: _Part) -> bool:
-    return isinstance(part, MethodEstimate) and not _reasons_against(part)
-
-
-def _reasons_against(part: MethodEstimate) -> tuple[str, ...]:
-    """Reasons against a part; whether sweeps matter is seen of both together."""
-    return tuple(reason for reason in part.reasons if reason not in part.sweep_reasons)
+    return isinstance(part, MethodEstimate) and not part.reasons
 
 
 def _label_estimate(labels: _Part) -> LabelEstimate:
-    if isinstance(labels, str) or _reasons_against(labels):
+    if isinstance(labels, str) or labels.reasons:
         return LabelEstimate()
     sure = bool((np.sqrt(np.diag(labels.covariance)) < _START_SIGMAS).all())
     has_motion = bool(labels.diagnostics["motion"].get("fused", False))
@@ -115,12 +110,12 @@ def fuse_parts(labels: _Part, edges: _Part) -> MethodEstimate:
     """
     if isinstance(labels, str) and isinstance(edges, str):
         raise EstimationError(f"by labels: {labels}; by edges: {edges}")
-    if isinstance(edges, str) or (_reasons_against(edges) and _usable(labels)):
+    if isinstance(edges, str) or (edges.reasons and _usable(labels)):
         assert not isinstance(labels, str)
         return _of_one_part(labels, ("edges", edges))
-    if isinstance(labels, str) or (_reasons_against(labels) and _usable(edges)):
+    if isinstance(labels, str) or (labels.reasons and _usable(edges)):
         return _of_one_part(edges, ("labels", labels))
-    if _reasons_against(labels):  # neither is usable
+    if labels.reasons:  # neither is usable
         reasons = [*(f"by labels: {each}" for each in labels.reasons)]
         reasons += [f"by edges: {each}" for each in edges.reasons]
         return replace(labels, reasons=tuple(reasons), solved=None)
@@ -130,7 +125,7 @@ def fuse_parts(labels: _Part, edges: _Part) -> MethodEstimate:
 def _of_one_part(used: MethodEstimate, left_out: tuple[str, _Part]) -> MethodEstimate:
     """One part, and why the other, of a name, was left out."""
     name, part = left_out
-    why = part if isinstance(part, str) else _reasons_against(part)[0]
+    why = part if isinstance(part, str) else part.reasons[0]
     remark = f"{name} were left out: {why}"
     facts = {} if isinstance(part, str) else {name: _facts(part)}
     return replace(
@@ -149,7 +144,7 @@ def _of_both_parts(labels: MethodEstimate, edges: MethodEstimate) -> MethodEstim
         # It has no part by the assumptions.
         of_static = replace(labels, covariance=labels.by_static_objects, assumption_steps={})
         static = Fused.of(of_static, edges).covariance
-    sweeps = dict.fromkeys((*labels.sweep_reasons, *edges.sweep_reasons))
+    sweeps = dict.fromkeys((*labels.open_sweeps, *edges.open_sweeps))
     shares = np.diag(fused.by_sweeps) / np.diag(fused.covariance)
     # What a frame brought to the labels' estimate is not what it brought to this one.
     diagnostics = {name: value for name, value in labels.diagnostics.items() if name != FRAME_INFORMATION}
@@ -160,7 +155,8 @@ def _of_both_parts(labels: MethodEstimate, edges: MethodEstimate) -> MethodEstim
         time_offset_s=fused.state.time_offsets_s[0],
         covariance=fused.covariance,
         frames=tuple(dict.fromkeys((*labels.frames, *edges.frames))),
-        reasons=(*_contradiction(fused), *(sweeps if (shares > MATTERS**2).any() else ())),
+        reasons=_contradiction(fused),
+        open_sweeps=tuple(sweeps) if (shares > MATTERS**2).any() else (),
         remarks=(*labels.remarks, *edges.remarks),
         by_static_objects=static,
         diagnostics=diagnostics

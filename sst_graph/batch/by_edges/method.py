@@ -90,7 +90,7 @@ def edges_method(
         solution.state.time_offsets_s[0],
         covariance,
         frames_used(drives, solution),
-        (*with_lens_reasons(reasons, lens_reasons, contrast), *own.reasons, *sweeps.reasons),
+        (*with_lens_reasons(reasons, lens_reasons, contrast), *own.reasons),
         remarks,
         by_static_objects=covariance,
         diagnostics=_diagnostics(solution, contrast, motion)
@@ -99,7 +99,7 @@ def edges_method(
         fit=fit,
         matched=MatchedDrives(matched, solution.state),
         by_sweeps=sweeps.covariance,
-        sweep_reasons=sweeps.reasons,
+        open_sweeps=sweeps.reasons,
         shared=own.shared,
         assumption_steps=own.assumption_steps,
     )

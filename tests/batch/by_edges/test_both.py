@@ -266,11 +266,12 @@ def test_parts_that_contradict_each_other_are_not_trusted() -> None:
 
 def test_undecided_sweeps_are_judged_by_what_they_do_to_both() -> None:
     sigmas = np.full(7, 0.01)
-    one = estimate(gtsam.Pose3(), 0.0, sigmas, "sweep")
-    for share, reasons in ((0.05, ()), (0.9, ("sweep",))):
-        part = replace(one, by_sweeps=share * one.covariance, sweep_reasons=("sweep",))
-        assert fuse_parts(part, replace(part, reasons=(), sweep_reasons=())).reasons == reasons
-        assert fuse_parts(part, part).reasons == reasons
+    one = estimate(gtsam.Pose3(), 0.0, sigmas)
+    for share, open_sweeps in ((0.05, ()), (0.9, ("sweep",))):
+        part = replace(one, by_sweeps=share * one.covariance, open_sweeps=("sweep",))
+        for other in (part, replace(part, open_sweeps=())):
+            found = fuse_parts(part, other)
+            assert found.open_sweeps == open_sweeps and found.reasons == ()
 
 
 def test_what_is_not_sound_is_left_out() -> None:
