@@ -12,7 +12,7 @@ export OMP_NUM_THREADS ?= 1
 # Without bytecode on disk each worker rewrites all tests, and each command that a test starts compiles the package.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup test test-slow lint demo bench guard mutate release-check ros-check image docs browser lock clean
+.PHONY: setup test test-slow lint demo bench tables guard mutate release-check ros-check image docs browser lock clean
 
 setup: $(INSTALLED)
 
@@ -45,6 +45,14 @@ bench: $(INSTALLED)
 	$(BIN)/python -m benchmarks.ratios --frames 10 --rounds 20
 	$(BIN)/python -m benchmarks.scaling --only frames --frames 1 5 20
 	$(BIN)/python -m benchmarks.tracker_run --frames 200 --markdown
+
+# The tables of the documentation that this code has not made yet: hours. DATA="STOP=DIR PARKED=DIR" names the
+# real drives, TABLES="accuracy" chooses by page or command.
+DATA ?=
+TABLES ?=
+
+tables: $(INSTALLED)
+	$(BIN)/python docs/make_tables.py $(TABLES) $(if $(DATA),--data $(DATA))
 
 # Fails when a hot path takes more than 1.2 times the instructions that benchmarks/guard.json says. Without
 # valgrind it says that nothing was checked; GUARD=--required makes that a failure.

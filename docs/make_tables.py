@@ -1,0 +1,177 @@
+"""Makes the tables of the pages again: ``python docs/make_tables.py --data STOP=DIR PARKED=DIR [WORD ...]``.
+
+A table stands between two comments, of which the first holds the command that makes it::
+
+    <!-- table: sst-graph experiment fit --set 'seeds=[21,22]' -->
+    <!-- end of table -->
+
+What the command prints goes between them, with the command above it and the version of the code below it.
+Words choose tables whose page or command has all of them. Tables that this code, or code that does not differ
+from it, has made are left as they are; so what was interrupted goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parent
+CODE = ("sst_graph", "factors", "studies", "benchmarks")
+"""Folders that figures depend on."""
+DRIVES = ("STOP", "PARKED")
+"""Names in commands that stand for the folders of drives."""
+BLOCK = re.compile(r"<!-- table: (?P<command>.+?) -->\n(?P<body>.*?)<!-- end of table -->", re.DOTALL)
+_STAMP = re.compile(r"^\*Made by sst-graph commit (?P<commit>[0-9a-f]+)\.\*$", re.MULTILINE)
+_ORIGIN = re.compile(r"^Made by `.*`, sst-graph .*$", re.MULTILINE)
+_ASSIGNMENT = re.compile(r"(?P<name>[A-Z_]+)=(?P<value>\S*)$")
+
+
+class TableError(Exception):
+    """A command that makes no table."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of a page.
+
+    Attributes:
+        page: where it stands.
+        command: that makes it, in one line.
+        commit: of the code that made it; empty where none is said.
+    """
+
+    page: Path
+    command: str
+    commit: str
+
+    def has(self, words: list[str]) -> bool:
+        """Whether its page or its command holds all words."""
+        return all(word in f"{self.page.stem} {self.command}" for word in words)
+
+
+def tables_of(page: Path) -> Iterator[Table]:
+    """The tables of a page between such comments."""
+    for block in BLOCK.finditer(page.read_text(encoding="utf-8")):
+        stamp = _STAMP.search(block["body"])
+        yield Table(page, block["command"], stamp["commit"] if stamp else "")
+
+
+def body(command: str, printed: str, commit: str) -> str:
+    """What stands between the comments.
+
+    Raises:
+        TableError: what was printed has no table.
+    """
+    text = _ORIGIN.sub("", printed).strip()
+    if not re.search(r"^\|.*\|$", text, re.MULTILINE):
+        raise TableError(f"no table in what it printed: {text[-200:]!r}")
+    return f"```\n{command}\n```\n\n{text}\n\n*Made by sst-graph commit {commit}.*\n"
+
+
+def replaced(text: str, command: str, new: str) -> str:
+    """A page with a new body for the table of a command."""
+
+    def one(block: re.Match[str]) -> str:
+        if block["command"] != command:
+            return block[0]
+        return f"<!-- table: {command} -->\n{new}<!-- end of table -->"
+
+    return BLOCK.sub(one, text)
+
+
+def printed_by(command: str, data: Mapping[str, str]) -> str:
+    """What a command prints, with the folders of drives in place of their names, and names again after it.
+
+    Raises:
+        TableError: a drive that is not given, or a command that fails.
+    """
+    lacking = [name for name in DRIVES if re.search(rf"\b{name}\b", command) and name not in data]
+    if lacking:
+        raise TableError(f"needs --data {' '.join(f'{name}=DIR' for name in lacking)}")
+    filled = command
+    for name, folder in data.items():
+        filled = re.sub(rf"\b{name}\b", lambda _, folder=folder: folder, filled)
+    words, environment = shlex.split(filled), dict(os.environ)
+    while words and (assigned := _ASSIGNMENT.match(words[0])):
+        environment[assigned["name"]] = assigned["value"]
+        words.pop(0)
+    programs = {"sst-graph": [sys.executable, "-m", "sst_graph"], "python": [sys.executable]}
+    if words[0] not in programs:
+        raise TableError(f"found {words[0]}, expected {' or '.join(programs)}")
+    done = subprocess.run(
+        [*programs[words[0]], *words[1:]],
+        cwd=ROOT,
+        env=environment | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode != 0:
+        raise TableError(f"exit code {done.returncode}: {done.stderr.strip()[-300:]}")
+    text = done.stdout
+    for name, folder in data.items():
+        text = text.replace(folder, name)
+    return text
+
+
+def same_code(commit: str) -> bool:
+    """Whether the code of a commit makes the figures that this code makes."""
+    if not commit:
+        return False
+    done = subprocess.run(["git", "diff", "--quiet", commit, "--", *CODE], cwd=ROOT, check=False)
+    return done.returncode == 0
+
+
+def _commit() -> str:
+    found = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    return found.stdout.strip()
+
+
+def main() -> int:
+    """Makes the tables that are chosen; 1 where one of them failed."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("words", nargs="*", metavar="WORD", help="of page or command (default: all tables)")
+    parser.add_argument("--data", nargs="+", default=[], metavar="NAME=DIR", help="drives that commands name")
+    parser.add_argument("--list", action="store_true", help="only print them, and which code made them")
+    args = parser.parse_args()
+    data = dict(pair.split("=", 1) for pair in args.data)
+    found = [table for page in sorted(HERE.rglob("*.md")) for table in tables_of(page)]
+    chosen = [table for table in found if table.has(args.words)]
+    if args.list:
+        for table in chosen:
+            state = "as now" if same_code(table.commit) else "other code"
+            print(f"{table.page.relative_to(HERE)}: {table.commit or 'never'} ({state}): {table.command}")
+        return 0
+    if not same_code("HEAD"):
+        parser.error(f"changes in {', '.join(CODE)} that are not committed: no version would name them")
+    failed, commit = 0, _commit()
+    for table in chosen:
+        if same_code(table.commit):
+            continue
+        began = time.monotonic()
+        try:
+            new = body(table.command, printed_by(table.command, data), commit)
+        except TableError as error:
+            failed += 1
+            print(f"{table.page.name}: {table.command}: {error}", file=sys.stderr, flush=True)
+            continue
+        table.page.write_text(
+            replaced(table.page.read_text(encoding="utf-8"), table.command, new), encoding="utf-8"
+        )
+        print(f"{table.page.name}: {time.monotonic() - began:.0f} s: {table.command}", flush=True)
+    return int(failed > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
