@@ -52,7 +52,7 @@ DATA ?=
 TABLES ?=
 
 tables: $(INSTALLED)
-	$(BIN)/python docs/make_tables.py $(TABLES) $(if $(DATA),--data $(DATA))
+	$(BIN)/python docs/make_tables.py $(TABLES) $(addprefix --data ,$(DATA))
 
 # Fails when a hot path takes more than 1.2 times the instructions that benchmarks/guard.json says. Without
 # valgrind it says that nothing was checked; GUARD=--required makes that a failure.

@@ -1,4 +1,6 @@
-"""Makes the tables of the pages again: ``python docs/make_tables.py --data STOP=DIR PARKED=DIR [WORD ...]``.
+"""Makes the tables of the pages again.
+
+``python docs/make_tables.py [WORD ...] [--data STOP=DIR] [--data PARKED=DIR]``
 
 A table stands between two comments, of which the first holds the command that makes it::
 
@@ -96,7 +98,7 @@ def printed_by(command: str, data: Mapping[str, str]) -> str:
     """
     lacking = [name for name in DRIVES if re.search(rf"\b{name}\b", command) and name not in data]
     if lacking:
-        raise TableError(f"needs --data {' '.join(f'{name}=DIR' for name in lacking)}")
+        raise TableError(f"needs {' '.join(f'--data {name}=DIR' for name in lacking)}")
     filled = command
     for name, folder in data.items():
         filled = re.sub(rf"\b{name}\b", lambda _, folder=folder: folder, filled)
@@ -138,14 +140,28 @@ def _commit() -> str:
     return found.stdout.strip()
 
 
+def _drive(text: str) -> tuple[str, str]:
+    name, _, folder = text.partition("=")
+    if name not in DRIVES or not Path(folder).is_dir():
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected {' or '.join(DRIVES)}=an existing folder")
+    return name, str(Path(folder).resolve())
+
+
 def main() -> int:
     """Makes the tables that are chosen; 1 where one of them failed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("words", nargs="*", metavar="WORD", help="of page or command (default: all tables)")
-    parser.add_argument("--data", nargs="+", default=[], metavar="NAME=DIR", help="drives that commands name")
+    parser.add_argument(
+        "--data",
+        action="append",
+        default=[],
+        type=_drive,
+        metavar="NAME=DIR",
+        help=f"a drive that commands name: {', '.join(DRIVES)} (repeatable)",
+    )
     parser.add_argument("--list", action="store_true", help="only print them, and which code made them")
     args = parser.parse_args()
-    data = dict(pair.split("=", 1) for pair in args.data)
+    data = dict(args.data)
     found = [table for page in sorted(HERE.rglob("*.md")) for table in tables_of(page)]
     chosen = [table for table in found if table.has(args.words)]
     if args.list:
