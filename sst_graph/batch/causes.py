@@ -14,6 +14,7 @@ from sst_graph.diagnosis import (
     Fitter,
     likely_causes,
     mirror,
+    other_axes,
     other_camera,
     preflight,
     uncalibrated,
@@ -52,6 +53,9 @@ def with_causes(
     found = preflight(drives, guess, config.classes if by_labels else ())
     causes = [*_wrong_sweeps(drives), *(finding.sentence for finding in found)]
     estimated = bool(result.frames_used)
+    if not causes and result.status != "ok" and config.method != "motion":
+        axes = other_axes(drives)
+        causes = [] if axes is None else [axes.sentence]
     if not causes and estimated:
         camera = other_camera(guess.cTl, result.T_camera_lidar, result.covariance)
         causes = [] if camera is None else [camera.sentence]

@@ -11,6 +11,7 @@ from typing import Literal, TypedDict, Unpack, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.data.lidar_pose import LidarFrameSource, parse_lidar_pose
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.factors.arguments import described, is_whole
 from sst_graph.files.reading import path_of
@@ -62,6 +63,9 @@ class SourceOptions:
             the cloud are read, too. None: no labels.
         stamps: of a bag: "header" as the sensors' drivers stamp, or "received" by the recorder, for drivers
             that leave the header's stamp at zero.
+        lidar_pose: T_cloud_lidar, "X,Y,Z" or "X,Y,Z,ROLL,PITCH,YAW" [m, deg], of clouds in other axes than
+            the LiDAR's, such as the vehicle's. They are moved to the LiDAR's as they are read, and
+            calibrations, the data's own included, are of these axes. None: they are in the LiDAR's axes.
     """
 
     sequence: str | None = None
@@ -78,6 +82,7 @@ class SourceOptions:
     info_topic: str | None = None
     mask_topic: str | None = None
     stamps: Stamps = "header"
+    lidar_pose: str | None = None
 
     def __post_init__(self) -> None:
         for name in wrong_fields(self):
@@ -111,6 +116,13 @@ class SourceOptions:
             )
         if self.frames is not None:
             _check_frames(self.frames)
+        if self.lidar_pose is not None:
+            parse_lidar_pose(self.lidar_pose)
+            if self.sweep in TURNS:
+                raise ConfigError(
+                    f"sweep {self.sweep}: found a lidar pose, with which times do not follow from azimuths "
+                    "about the cloud's origin: expected auto, or points with times"
+                )
 
     def timing(self, stamps_ns: NDArray[np.int64]) -> SweepTiming | None:
         """Times of points by azimuth, where a sense of rotation is named; stamps_ns: (n,) of the scans.
@@ -159,7 +171,10 @@ class Loader:
                 raise ConfigError(
                     f"--{name.replace('_', '-')} {value}: means nothing for {path} ({self.layout})"
                 )
-        return self.open(path, options)
+        source = self.open(path, options)
+        if options.lidar_pose is None:
+            return source
+        return LidarFrameSource(source, parse_lidar_pose(options.lidar_pose))
 
 
 ENTRY_POINTS = "sst_graph.loaders"
@@ -230,6 +245,7 @@ class ReadOptions(TypedDict, total=False):
     info_topic: str | None
     mask_topic: str | None
     stamps: Stamps
+    lidar_pose: str | None
 
 
 def open_source(

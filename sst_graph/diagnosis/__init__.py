@@ -11,7 +11,7 @@ from sst_graph.diagnosis.cameras import uncalibrated
 from sst_graph.diagnosis.causes import likely_causes, mirror, preflight
 from sst_graph.diagnosis.finding import Finding
 from sst_graph.diagnosis.fit import Fit, Fitter
-from sst_graph.diagnosis.lasers import unknown_lasers
+from sst_graph.diagnosis.lasers import other_axes, unknown_lasers
 from sst_graph.diagnosis.poses import other_camera
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "Fitter",
     "likely_causes",
     "mirror",
+    "other_axes",
     "other_camera",
     "preflight",
     "uncalibrated",

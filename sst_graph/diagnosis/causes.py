@@ -46,9 +46,7 @@ def likely_causes(
         result: how well they agree in the result, where there is one.
     """
     drive = max(drives, key=lambda one: len(one.scans))
-    certain = (
-        labels.foreign_masks(labels.shift(drives)) or units.axes(drive, guess.cTl) or units.origin(drive)
-    )
+    certain = labels.foreign_masks(labels.shift(drives)) or units.axes(drive, guess.cTl)
     if certain is not None:
         return (certain,)
     given = fit(drive, guess)

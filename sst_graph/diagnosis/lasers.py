@@ -1,12 +1,18 @@
-"""Clouds that do not tell by which laser each point was measured."""
+"""Clouds that do not tell by which laser each point was measured, or from where."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+import gtsam
+import numpy as np
+
+from sst_graph.data.lidar_pose import lidar_pose_text
 from sst_graph.diagnosis.finding import Finding
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import count_of
+from sst_graph.features.lidar_origin import LidarOrigin, lidar_origin, own_clearness
+from sst_graph.sampling import evenly_spread
 
 _MOST = 0.5
 """Share of the scans above which it is said: a scan now and then is cut short."""
@@ -24,4 +30,46 @@ def unknown_lasers(drives: Sequence[Drive]) -> Finding | None:
         f"{missing} of {count_of(len(known), 'scan')} have no field 'ring', and their points come neither "
         "ring after ring nor firing after firing",
         "give the clouds with the field 'ring', or as the LiDAR's driver stores them",
+    )
+
+
+_SCANS, _LEAST_POINTS = 3, 2000
+"""Scans in which the origin is looked for, and points that each must have."""
+_CLEAR = 3.4
+"""Rings that stand out so clearly from the cloud's own origin are those of a LiDAR that is there: 3.7 to 4.8
+on real scans, 3.0 without rings."""
+_SAME_M = 0.3
+"""Scans agree about the origin within this; the best origins of scans without rings lie anywhere."""
+_AWAY_M = 0.5
+"""Nearer to the cloud's origin it is the scanner's own optical centre, or motion within a sweep."""
+
+
+def other_axes(drives: Sequence[Drive]) -> Finding | None:
+    """Clouds in axes that are not those of their LiDAR, such as the vehicle's: seen from another place, the
+    same in all scans, their rings stand out."""
+    drive = max(drives, key=lambda one: len(one.scans))
+    known = () if drive.statistics is None else drive.statistics.scans
+    clouds = [scan.some_points for scan in known if len(scan.some_points) >= _LEAST_POINTS]
+    chosen = [clouds[k].astype(np.float64) for k in evenly_spread(range(len(clouds)), _SCANS)]
+    if len(chosen) < _SCANS or max(map(own_clearness, chosen)) > _CLEAR:
+        return None
+    found = [lidar_origin(cloud) for cloud in chosen]
+    places = np.array([one.T_cloud_lidar.translation() for one in found])
+    middle = np.median(places, axis=0)
+    if np.linalg.norm(places - middle, axis=1).max() > _SAME_M or np.linalg.norm(middle) < _AWAY_M:
+        return None
+    pose = lidar_pose_text(_median_pose(found))
+    return Finding(
+        "the clouds are not in the axes of the LiDAR but in others, such as the vehicle's",
+        f"seen from {', '.join(f'{x:.2f}' for x in middle)} m in them the LiDAR's rings stand out, not from "
+        "their origin",
+        f"say where the LiDAR is in them, as --lidar-pose={pose} (better from tf or a drawing)",
+    )
+
+
+def _median_pose(found: Sequence[LidarOrigin]) -> gtsam.Pose3:
+    poses = [one.T_cloud_lidar for one in found]
+    roll, pitch, yaw = np.median([pose.rotation().rpy() for pose in poses], axis=0)
+    return gtsam.Pose3(
+        gtsam.Rot3.RzRyRx(roll, pitch, yaw), np.median([pose.translation() for pose in poses], axis=0)
     )

@@ -111,18 +111,6 @@ def axes(drive: Drive, guess: gtsam.Pose3 | None) -> Finding | None:
     )
 
 
-def origin(drive: Drive) -> Finding | None:
-    """Clouds whose origin lies on the ground: no LiDAR is there."""
-    ground = usual_ground(drive)
-    if ground is None or ground.share < FLAT or ground.height > 0.5 * ground.tolerance:
-        return None
-    return Finding(
-        "the clouds are in the frame of the vehicle (base_link), not of the LiDAR",
-        f"their origin lies on the ground, to {ground.height:.2g} m",
-        "give the clouds as the LiDAR measures them: edges are found along its beams",
-    )
-
-
 def start_unit(guess: gtsam.Pose3 | None) -> Finding | None:
     """A start whose translation is in another unit than metres."""
     if guess is None:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from sst_graph.features.lidar_origin import some_points
 from sst_graph.features.mask_shift import ContourProfile, contour_profiles
 from sst_graph.types import CameraImage, FloatArray, Frame, Scan, SemanticClass
 
@@ -73,6 +74,7 @@ class ScanStatistics:
             one of the chosen ones.
         median_range: of its points, in the cloud's unit; 0 of a scan without points.
         lasers: whether the data tell by which laser each point was measured; of a scan without points, too.
+        some_points: (m, 3) of its points, evenly in their order; none unless it is one of the chosen ones.
     """
 
     index: int
@@ -86,6 +88,7 @@ class ScanStatistics:
     step: float = 0.0
     median_range: float = 0.0
     lasers: bool = True
+    some_points: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
 
     def hash(self) -> str:
         """Of its points: 16 hexadecimal digits, the same wherever the scan is read."""
@@ -165,8 +168,9 @@ def scan_statistics(index: int, scan: Scan, closely: bool = True) -> ScanStatist
     sweep = 0.0
     if scan.offsets_s is not None and len(scan.offsets_s):
         sweep = float(np.ptp(np.asarray(scan.offsets_s, np.float64)))
-    ground, heights, step = None, np.zeros(0), 0.0
+    ground, heights, step, some = None, np.zeros(0), 0.0, scan.points[:0]
     if closely:
+        some = some_points(scan.points).copy()
         step = _step(points)
         on_ground = _labelled_ground(scan.classes)
         ground = _ground(points[on_ground], points[~on_ground])
@@ -178,7 +182,18 @@ def scan_statistics(index: int, scan: Scan, closely: bool = True) -> ScanStatist
     sample = _sample(scan.points)
     lasers = scan.rings is not None or not len(points)
     return ScanStatistics(
-        index, scan.stamp_ns, digest, sweep, labelled, ground, heights, sample, step, median_range, lasers
+        index,
+        scan.stamp_ns,
+        digest,
+        sweep,
+        labelled,
+        ground,
+        heights,
+        sample,
+        step,
+        median_range,
+        lasers,
+        some,
     )
 
 

@@ -33,7 +33,7 @@ _HEIGHTS_M = np.linspace(-0.3, 0.4, 36)
 """Heights that are tried for the tips of all cones [m]: 0.2 of an HDL-64E."""
 _NEAREST_M, _HEIGHT_POINTS = 3.0, 20_000
 """The height is looked for with points beyond so many metres, about so many of them."""
-_PARTS_OF_RINGS, _STRIPS_OF_RINGS = 400, 20
+PARTS_OF_RINGS, STRIPS_OF_RINGS = 400, 20
 """Shares of the points that are less than a ring, and some rings, of 16 to 128."""
 _LEAST_GAP = 1e-5
 """Slopes are not told apart below this: float32 of points far away."""
@@ -97,24 +97,26 @@ def arrange_beams(points: FloatArray, rings: NDArray[np.integer] | None) -> Beam
 
 
 def common_height(z: FloatArray, rho: FloatArray) -> float:
-    """Height of the cones' tips, one for all, from which rings stand out most [m]; z, rho: (n,) [m].
-
-    Along the sorted slopes, points of a ring are then close together in comparison with points some rings
-    apart. Gaps are compared by their logarithms, so that no scale of the slopes is preferred.
-    """
+    """Height of the cones' tips, one for all, from which rings stand out most [m]; z, rho: (n,) [m]."""
     some = np.flatnonzero(rho > _NEAREST_M)
     some = some[:: 1 + len(some) // _HEIGHT_POINTS]
-    near, apart = len(some) // _PARTS_OF_RINGS, len(some) // _STRIPS_OF_RINGS
-    if near < 1:
+    if len(some) < PARTS_OF_RINGS:
         return 0.0
+    return float(max(_HEIGHTS_M, key=lambda height: clearness((z[some] - height) / rho[some])))
 
-    def clearness(height: float) -> float:
-        slope = np.sort((z[some] - height) / rho[some])
-        gaps = (np.maximum(slope[step:] - slope[:-step], _LEAST_GAP) for step in (apart, near))
-        wide, narrow = (float(np.log(gap).mean()) for gap in gaps)
-        return wide - narrow
 
-    return float(max(_HEIGHTS_M, key=clearness))
+def clearness(slopes: FloatArray, parts: int = PARTS_OF_RINGS) -> float:
+    """How clearly rings stand out of the slopes z / rho of points (n,), ``parts`` or more.
+
+    Along the sorted slopes, points of a ring are close together in comparison with points some rings apart.
+    Gaps are compared by their logarithms, so that no scale of the slopes is preferred; without rings it is
+    log(parts / STRIPS_OF_RINGS).
+    """
+    rising = np.sort(slopes)
+    near, apart = len(rising) // parts, len(rising) // STRIPS_OF_RINGS
+    gaps = (np.maximum(rising[step:] - rising[:-step], _LEAST_GAP) for step in (apart, near))
+    wide, narrow = (float(np.log(gap).mean()) for gap in gaps)
+    return wide - narrow
 
 
 def recover_rings(elevation: FloatArray, rho: FloatArray) -> IntArray:

@@ -126,5 +126,7 @@ def test_an_interrupted_run_leaves_nothing_at_all(tmp_path: Path) -> None:
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
-    assert (process.returncode, err) == (130, "sst-graph: error: interrupted\n")
+    # A slow machine is told how far it is.
+    said = [line for line in err.splitlines() if "progress" not in line]
+    assert (process.returncode, said) == (130, ["sst-graph: error: interrupted"])
     assert list(tmp_path.iterdir()) == []

@@ -10,7 +10,7 @@ from sst_graph import CalibrationConfig
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.diagnosis.labels import ground_points
-from sst_graph.diagnosis.units import clouds, origin
+from sst_graph.diagnosis.units import clouds
 from sst_graph.drive.input_statistics import InputStatistics, scan_statistics
 from sst_graph.drive.preparation import Drive
 from sst_graph.simulator import SimulationConfig
@@ -93,14 +93,3 @@ def test_vehicles_seen_in_part_have_their_unit_where_no_ground_is_seen() -> None
     roofs = boxes(1.5, 1.7)
     roofs = roofs[roofs[:, 2] > -0.55]
     assert clouds(drive({SemanticClass.VEHICLE: roofs})) is None
-
-
-@pytest.mark.parametrize("level_m", [0.02, 0.0, -0.02])
-def test_clouds_in_the_frame_of_the_vehicle(level_m: float) -> None:
-    parts = {
-        SemanticClass.GROUND: ground(0.0, 1.7) + np.array([0.0, 0.0, 1.7 + level_m]),
-        SemanticClass.VEHICLE: boxes(1.5, -level_m),
-    }
-    found = origin(drive(parts))
-    assert found is not None and "base_link" in found.cause and clouds(drive(parts)) is None
-    assert origin(drive({SemanticClass.GROUND: ground(0.0, 0.3)})) is None

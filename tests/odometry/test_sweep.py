@@ -396,6 +396,18 @@ def test_what_is_said_of_the_sweep_is_compared_with_the_scans(
     assert any(decision.contradiction in reason for reason in checked.reasons[:1]) == bool(instead)
 
 
+@pytest.mark.parametrize(("fraction", "in_part"), [(-1.0, False), (0.0, False), (1.0, False), (-0.5, True)])
+def test_points_that_were_moved_by_half_of_the_motion_contradict_every_hypothesis(
+    fraction: float, in_part: bool
+) -> None:
+    decision = decide_sweep(_hall(6.0, fraction, 180.0), 14)
+    assert ("by the whole motion" in decision.contradiction) == in_part
+    assert (decision.kind == "undecided") == in_part
+    if in_part:
+        assert "in them -0.5" in decision.contradiction and decision.contradiction in decision.sentence
+        assert decision.given_as("compensated").contradiction == decision.contradiction
+
+
 def test_nothing_is_compared_where_the_sweep_is_known_or_not_to_be_decided() -> None:
     for source, decide in ((Hall(-1.0, "known"), True), (Hall(-1.0, "compensated"), False)):
         decision = with_sweep(source, decide).sweep_decision  # type: ignore[arg-type]

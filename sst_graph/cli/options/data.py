@@ -10,6 +10,7 @@ SOURCE_DEFAULTS: dict[str, str | int | float | None] = {
     "frames": None,
     "camera": "image_2",
     "cloud": "velodyne",
+    "lidar_pose": None,
     "image_shift": 0,
     "sweep": "auto",
     "sweep_start_deg": 180.0,
@@ -45,6 +46,12 @@ def add_source_options(command: argparse.ArgumentParser, several_cameras: bool =
     else:
         source.add_argument("--camera", metavar="NAME", help=named)
     source.add_argument("--cloud", help=f"folder of the scans (default {SOURCE_DEFAULTS['cloud']})")
+    source.add_argument(
+        "--lidar-pose",
+        metavar="X,Y,Z[,ROLL,PITCH,YAW]",
+        help="T_cloud_lidar: where the LiDAR is in the axes of the clouds [m, deg], if these are not its own "
+        "but, say, the vehicle's (base_link); calibrations are then of the LiDAR's axes",
+    )
     source.add_argument(
         "--image-shift",
         type=int,

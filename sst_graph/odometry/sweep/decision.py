@@ -57,6 +57,9 @@ _ERROR_RATE = 0.001
 one occurs in this fraction of drives at most, where the error model holds."""
 _TOLERANCE = 0.2
 """The estimated share may differ so much from 0 or 1 beside three of its sigmas."""
+_PART, _PART_SIGMAS = 0.25, 6.0
+"""Farther than this from 0, -1 and 1, beside so many of its sigmas, the share is that of points which were
+moved by a part of the motion, or by the wrong one. Of whole sweeps it comes out up to 0.23 off."""
 _LONG_SWEEP_M = 1.0
 """Where the vehicle moves farther in a turn, a wrong hypothesis keeps the matches made under it, and all
 hypotheses are tried as starts [m]."""
@@ -78,7 +81,8 @@ class SweepDecision:
         speed_mps: fastest mean speed of the windows.
         frames: positions of the scans used, in the order of the drive.
         others: times of the points under the hypotheses that are not excluded, beside ``timing``.
-        contradiction: how the scans contradict what was said of the sweep; empty where they do not.
+        contradiction: how the scans contradict what was said of the sweep, or every hypothesis; empty where
+            they do not.
     """
 
     kind: SweepKind
@@ -112,6 +116,8 @@ class SweepDecision:
         if self.kind == "standstill":
             return "assumed compensated: at standstill it does not matter"
         if self.kind == "undecided":
+            if self.contradiction:
+                return f"assumed compensated, but {self.contradiction}"
             return (
                 f"not determined by the scans ({self.evidence}); assumed compensated, its effect is in the "
                 f"sigmas; if you know it, {REMEDY}"
@@ -138,7 +144,7 @@ class SweepDecision:
         """What was said of the sweep, one of :data:`CLAIMS`, which holds; where this decision, of the same
         scans, is another one, ``contradiction`` says so.
         """
-        claim, contradiction = CLAIMS[word], ""
+        claim, contradiction = CLAIMS[word], self.contradiction
         if self.kind in FRACTIONS and self.kind != claim:
             contradiction = (
                 f"the scans are not as --sweep {word} says, but {self.sentence}: leave --sweep out, or say "
@@ -336,6 +342,18 @@ def _compare_hypotheses(
         {name: float(np.sqrt(2.0 * value)) for name, value in behind.items()},
         start_known and best != "compensated",
         others=() if decided else tuple(other for other in others if not other.instant),
+        contradiction=_in_part(share, sigma) if informed else "",
+    )
+
+
+def _in_part(share: float, sigma: float) -> str:
+    """That the points hold a part of the sweep only; empty where they may hold all or nothing of it."""
+    if min(abs(share - f) for f in FRACTIONS.values()) <= _PART + _PART_SIGMAS * sigma:
+        return ""
+    return (
+        "the points are neither as measured nor all moved to one instant (share of the sweep in them "
+        f"{share:+.2f} +- {sigma:.2g}; 0, -1 or +1 expected): compensate them once, by the whole motion, or "
+        "give their times"
     )
 
 

@@ -1,0 +1,70 @@
+"""Clouds that are not in the axes of their LiDAR: those of the vehicle, say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+
+from sst_graph.data.scan_order import rings_from_order
+from sst_graph.data.source_view import ChangedSource
+from sst_graph.errors import ConfigError
+from sst_graph.types import GroundTruth, Scan, Source
+
+_EXPECTED = "expected X,Y,Z or X,Y,Z,ROLL,PITCH,YAW [m, deg]"
+_FARTHEST_M = 100.0
+
+
+def parse_lidar_pose(text: str) -> gtsam.Pose3:
+    """T_cloud_lidar of "X,Y,Z" or "X,Y,Z,ROLL,PITCH,YAW" [m, deg]: R = Rz(yaw) Ry(pitch) Rx(roll), as URDF.
+
+    Raises:
+        ConfigError: the text is none of these.
+    """
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        raise ConfigError(f"lidar pose {text!r:.80}: {_EXPECTED}") from None
+    if len(values) not in (3, 6) or not np.isfinite(values).all():
+        raise ConfigError(f"lidar pose {text!r:.80}: {_EXPECTED}")
+    if max(map(abs, values[:3])) > _FARTHEST_M or max(map(abs, [0.0, *values[3:]])) > 360.0:
+        raise ConfigError(
+            f"lidar pose {text!r:.80}: expected metres, {_FARTHEST_M:g} at most, and degrees, 360 at most"
+        )
+    turn = gtsam.Rot3.RzRyRx(*np.radians(values[3:])) if len(values) == 6 else gtsam.Rot3()
+    return gtsam.Pose3(turn, np.array(values[:3]))
+
+
+def lidar_pose_text(T_cloud_lidar: gtsam.Pose3) -> str:
+    """A pose as :func:`parse_lidar_pose` reads it: to centimetres and tenths of a degree."""
+    angles = np.degrees(T_cloud_lidar.rotation().rpy())
+    metres = ",".join(f"{value:.2f}" for value in T_cloud_lidar.translation())
+    turned = ",".join(f"{value:.1f}" for value in angles)
+    return f"{metres},{turned}" if np.abs(angles).max() > 0.05 else metres
+
+
+class LidarFrameSource(ChangedSource):
+    """A source whose clouds are moved to the LiDAR's axes as they are read; poses are of these axes."""
+
+    def __init__(self, source: Source, T_cloud_lidar: gtsam.Pose3) -> None:
+        self.source, self.T_cloud_lidar = source, T_cloud_lidar
+
+    @property
+    def nominal(self) -> gtsam.Pose3 | None:
+        """Nominal cTl of the data, of the LiDAR's axes."""
+        nominal = self.source.nominal
+        return None if nominal is None else nominal * self.T_cloud_lidar
+
+    @property
+    def truth(self) -> GroundTruth | None:
+        """Truth, where the data bring it, of the LiDAR's axes."""
+        truth = self.source.truth
+        return None if truth is None else replace(truth, cTl=truth.cTl * self.T_cloud_lidar)
+
+    def changed_scan(self, scan: Scan) -> Scan:
+        """The scan in the LiDAR's axes. Lasers that its order shows are seen from there."""
+        R, t = self.T_cloud_lidar.rotation().matrix(), self.T_cloud_lidar.translation()
+        points = ((scan.points.astype(np.float64) - t) @ R).astype(np.float32)
+        by_order = rings_from_order(points)
+        return replace(scan, points=points, rings=scan.rings if by_order is None else by_order)
