@@ -342,7 +342,8 @@ def _compare_hypotheses(
         {name: float(np.sqrt(2.0 * value)) for name, value in behind.items()},
         start_known and best != "compensated",
         others=() if decided else tuple(other for other in others if not other.instant),
-        contradiction=_in_part(share, sigma) if informed else "",
+        # The start under which a part of a turn fits best need not be that of a whole one.
+        contradiction=_in_part(found.fraction, float(evidence.sigma[found.sector])) if informed else "",
     )
 
 
