@@ -22,7 +22,9 @@ MAX_POINT_BYTES = 1024
 """Of one point with all its fields."""
 
 RINGS = ("ring", "rings", "channel", "laser_id")
-TIMES = ("time", "times", "t", "timestamp", "time_stamp", "offset_time")
+"""Fields, in lower case, with the number of the laser."""
+TIMES = ("time", "times", "t", "timestamp", "time_stamp", "offset_time", "time_offset", "time_offset_ns")
+"""Fields with the time of a point: of Velodyne, Ouster, Hesai and RoboSense, Livox, Aeva."""
 LABELS = ("label", "labels")
 INTENSITIES = ("intensity", "reflectivity", "reflectance", "remission", "i")
 

@@ -42,7 +42,8 @@ def image_geometry(message: Any, image_topic: str, size: Size, place: str) -> Im
     """Geometry of images of ``size`` by their CameraInfo.
 
     Images of a topic with a word that begins with "rect" in its name, as image_proc writes them, have the
-    intrinsics of P and the rotation R; all others have those of K and the distortion D.
+    intrinsics of P and the rotation R; all others have those of K and the distortion D. Where P is left at
+    zero and nothing is distorted K holds for either.
 
     Raises:
         DataError: no calibration, one of another size, or an unknown distortion.
@@ -54,8 +55,8 @@ def image_geometry(message: Any, image_topic: str, size: Size, place: str) -> Im
         expected = f"{size[0]}x{size[1]} px, the size of the images"
         raise DataError(place, f"{calibrated[0]}x{calibrated[1]} px", expected)
     table |= {"width": size[0], "height": size[1]}
-    rectified = _RECTIFIED.search(image_topic) is not None
-    D = table["D"] if "D" in table else table["d"]
+    D, P = (table[name] if name in table else table[name.lower()] for name in "DP")
+    rectified = _RECTIFIED.search(image_topic) is not None and bool(np.any(P) or np.any(D))
     if not len(D):
         # Drivers without a calibrated lens name a model and leave D empty.
         table["distortion_model"] = "none"
