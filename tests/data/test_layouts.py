@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+from dataclasses import asdict
 from pathlib import Path
 
 import gtsam
@@ -17,7 +18,7 @@ from sst_graph import CalibrationConfig, calibrate
 from sst_graph.cameras import BrownConradyCamera, Rectification
 from sst_graph.cli import main
 from sst_graph.data import open_source
-from sst_graph.data.info import drive_info
+from sst_graph.data.info import drive_info, info_text
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.errors import DataError
 from sst_graph.types import Frame, Source
@@ -78,6 +79,16 @@ def test_a_folder_of_a_lens_that_distorts_is_rectified(tmp_path: Path) -> None:
     for found, raw in zip(drive[1:3], plain[1:3], strict=True):  # type: ignore[misc]
         assert found.image == rectification.image(raw.image) and found.scan == raw.scan
         assert found.image.mask.shape == (drive.camera.height, drive.camera.width)
+    info = drive_info(drive)
+    lens = {
+        "model": "plumb_bob",
+        **asdict(plain.camera),
+        "distortion": {"coefficients": (-0.1, 0.0, 0.0, 0.0)},
+    }
+    assert info.camera["lens"] == lens and info.image_sensor == drive_info(plain).image_sensor
+    lines = info_text(info).splitlines()
+    assert lines[2].strip().startswith("rectified from plumb_bob") and lines[2].endswith("-0.1 0 0 0")
+    assert "lens" not in drive_info(plain).camera
 
 
 @pytest.mark.slow
@@ -99,7 +110,10 @@ def test_motion_needs_neither_labels_nor_tr(tmp_path: Path, capsys: pytest.Captu
     assert np.abs(step).max() < 1e-12 and results[0].time_offset_s == results[1].time_offset_s
     assert results[1].frames_used
     assert main(["calibrate", str(bare), "--method", "motion", "--out", str(tmp_path / "out")]) == 2
-    assert "brings no nominal calibration: give --init none" in capsys.readouterr().err
+    assert (
+        "brings no nominal calibration (calib.txt has no line Tr): give --init none"
+        in capsys.readouterr().err
+    )
 
 
 @pytest.mark.slow

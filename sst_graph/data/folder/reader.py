@@ -136,7 +136,9 @@ def open_folder(path: Path, options: SourceOptions) -> Source:
     def image(k: int) -> CameraImage:
         return pictures.image(k, int(images.stamps_ns[k]))
 
-    properties = DriveProperties(printable(path.resolve().name), model.intrinsics, nominal)
+    reason = f"by {_EXTRINSIC}" if nominal is not None else f"no {_EXTRINSIC}"
+    name = printable(path.resolve().name)
+    properties = DriveProperties(name, model.intrinsics, nominal, nominal_reason=reason)
     of_scans = Sensor(clouds.stamps_ns, scans.scan, _CLOUDS)
     of_images = Sensor(images.stamps_ns, image, _IMAGES)
     drive = merged(properties, of_scans, of_images, options, path)

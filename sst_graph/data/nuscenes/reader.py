@@ -147,7 +147,13 @@ def open_nuscenes(path: Path, options: SourceOptions) -> Source:
     name = f"nuscenes/{printable(text_of(scene, 'name', tables))}"
     notes = tuple(_left_out(before, after) for before, after in zip(stored, (lidar, camera), strict=True))
     properties = DriveProperties(
-        name, model.intrinsics, nominal, GroundTruth(nominal, None), True, notes=tuple(filter(None, notes))
+        name,
+        model.intrinsics,
+        nominal,
+        GroundTruth(nominal, None),
+        True,
+        nominal_reason="by calibrated_sensor.json",
+        notes=tuple(filter(None, notes)),
     )
     for note in properties.notes:
         _LOG.warning("%s: %s", printable(path), note)

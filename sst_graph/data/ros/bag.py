@@ -25,6 +25,7 @@ TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 _OLD_TF_MESSAGE = "tf/msg/tfMessage"
 """The same message under the name that it has in bags of the first versions of ROS 1."""
 
+_LONGEST_PROFILE = 256
 _KEPT = 8
 """Messages that are kept of those read last: image, mask and scan of one instant stand side by side."""
 _SKIPPED_AT_MOST = 16
@@ -93,6 +94,9 @@ class Bag:
                     raise ValueError(f"topic {one.topic!r:.40} of type {one.msgtype!r:.40}")
         except Exception as error:
             stack.close()
+            profile = _profile(self.path)
+            if profile not in ("", "ros2"):
+                raise DataError(self.path, f"MCAP of profile {profile!r:.40}", "profile 'ros2'") from error
             raise _unreadable(self.path, error) from error
         weakref.finalize(self, stack.close)
         self._types = message_types(self.is_ros1)
@@ -236,6 +240,23 @@ def message_types(is_ros1: bool) -> Any:
     if TF_MESSAGE not in types.fielddefs:
         types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF_MESSAGE))
     return types
+
+
+def _profile(path: Path) -> str:
+    """Profile in the header of an MCAP file, which says whose messages it holds; empty where none does.
+
+    A header is the file's first record: magic (8 bytes), opcode 1, length of the record (8) and of the
+    profile's name (4).
+    """
+    try:
+        with open(path, "rb") as stream:
+            start = stream.read(_LONGEST_PROFILE)
+    except OSError:
+        return ""
+    if not start.startswith(b"\x89MCAP") or len(start) < 21:
+        return ""
+    (length,) = struct.unpack_from("<I", start, 17)
+    return start[21 : 21 + length].decode("utf-8", "replace")
 
 
 def _close(reader: Any) -> None:

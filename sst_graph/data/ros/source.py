@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from sst_graph.cameras import Rectification
 from sst_graph.classes import MaskEncoding, guess_mask_encoding
+from sst_graph.data.arrays import listed
 from sst_graph.data.rectified import RectifiedSource
 from sst_graph.data.ros.bag import Bag, Topic
 from sst_graph.data.ros.camera_info import image_geometry
@@ -32,7 +33,7 @@ _LOG = logging.getLogger(__name__)
 
 LAYOUT = "a bag: PATH.bag (ROS 1), PATH.mcap, PATH.db3, or a rosbag2 folder with metadata.yaml"
 
-_SUFFIXES = (".bag", ".mcap", ".db3")
+_SUFFIXES, _METADATA = (".bag", ".mcap", ".db3"), "metadata.yaml"
 _MASKS_TO_JUDGE = 8
 """How many masks, spread over the drive, decide on their encoding."""
 
@@ -96,8 +97,33 @@ class BagMessages:
 
 
 def is_ros(path: Path) -> bool:
-    """Whether a path is a bag."""
-    return path.suffix in _SUFFIXES if path.is_file() else (path / "metadata.yaml").is_file()
+    """Whether a path is a bag, or a folder of some."""
+    if path.is_file():
+        return path.suffix in _SUFFIXES
+    return (path / _METADATA).is_file() or bool(_bag_files(path))
+
+
+def _bag_files(path: Path) -> list[Path]:
+    """Bags that are files of a folder."""
+    return [entry for entry in listed(path, LAYOUT) if entry.suffix in _SUFFIXES and entry.is_file()]
+
+
+def _only_bag(path: Path) -> Path:
+    """The bag that a path names: itself, or the only file of a folder without metadata.yaml.
+
+    Raises:
+        DataError: no bag, or several files that nothing puts together.
+    """
+    if not is_ros(path):
+        raise DataError(path, "no file or folder" if not path.exists() else "no bag", LAYOUT)
+    if path.is_file() or (path / _METADATA).is_file():
+        return path
+    files = _bag_files(path)
+    if len(files) > 1:
+        some = ", ".join(file.name for file in files[:4]) + (", ..." if len(files) > 4 else "")
+        expected = f"{_METADATA} beside them ('ros2 bag reindex' writes it), or one of them as DATA"
+        raise DataError(path, f"{count_of(len(files), 'bag')} ({some}) without {_METADATA}", expected)
+    return files[0]
 
 
 def open_ros(path: Path, options: SourceOptions) -> Source:
@@ -111,8 +137,7 @@ def open_ros(path: Path, options: SourceOptions) -> Source:
         ConfigError: an option that means nothing for bags, or no such range of frames.
         MissingDependencyError: rosbags is not installed.
     """
-    if not is_ros(path):
-        raise DataError(path, "no file or folder" if not path.exists() else "no bag", LAYOUT)
+    path = _only_bag(path)
     bag = Bag(path)
     topics = choose_topics(path, bag.topics, options)
     index = read_index(bag, topics, options.stamps)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -220,6 +221,35 @@ def test_options_of_other_formats(
     assert "--sequence 1: means nothing for" in refused(capsys, path, "--sequence", "1")
     assert "--mask-topic /m: means nothing for" in refused(capsys, kitti_drive, "--mask-topic", "/m")
     assert "the drive has frames 0:4" in refused(capsys, path, "--frames", "3:9")
+
+
+@pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
+def test_a_folder_whose_recording_was_ended_before_its_metadata(
+    kind: Kind, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One file is the bag; several are put together by ROS, which knows how."""
+    path = made(tmp_path, fill, kind=kind)
+    whole = open_source(path)
+    (path / "metadata.yaml").unlink()
+    alone = open_source(path)
+    stamps = [[frame.scan.stamp_ns for frame in drive if frame.scan is not None] for drive in (alone, whole)]
+    assert len(stamps[0]) == 4 and stamps[0] == stamps[1]
+    (only,) = files_of(path, {"mcap": ".mcap", "sqlite3": ".db3"}[kind])
+    shutil.copy(only, path / f"later{only.suffix}")
+    found = refused(capsys, path)
+    assert "found 2 bags (drive" in found and "'ros2 bag reindex' writes it" in found
+
+
+def test_an_mcap_file_of_other_messages_than_those_of_ros_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = made(tmp_path, fill)
+    (only,) = files_of(path, ".mcap")
+    data = only.read_bytes()
+    assert data[21:25] == b"ros2"
+    other = tmp_path / "other.mcap"
+    other.write_bytes(data[:21] + b"ros1" + data[25:])
+    assert "found MCAP of profile 'ros1', expected profile 'ros2'" in refused(capsys, other)
 
 
 def test_what_is_no_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
