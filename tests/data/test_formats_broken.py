@@ -152,7 +152,7 @@ BROKEN: list[tuple[str, Change, str]] = [
     ("folder", write("images/first.png", b""), "the name 'first', expected a stamp"),
     ("folder", write("images.csv", "a.png,100\n"), "'a.png', expected the name of a file in images"),
     ("folder", write("images.csv", "name,stamp_ns\n"), "no stamp"),
-    ("folder", write("images.csv", "0.png,1.5\n"), "'0.png,1.5', expected name,stamp_ns"),
+    ("folder", write("images.csv", "0.png,1e9\n"), "'0.png,1e9', expected name,stamp or stamp,name"),
     ("folder", write("clouds/0.000000001.bin", bytes(3)), "3 bytes, expected a multiple of 16"),
     ("nuscenes", write("v1.0-mini/sample.json", "[{"), "no whole record after 0"),
     ("nuscenes", write("v1.0-mini/scene.json", "{}"), "expected a table of nuScenes"),
@@ -256,6 +256,31 @@ def test_stamps_in_a_table_and_files_that_are_not_in_it(folder: Path) -> None:
     assert stamps == [7_000_000, 57_000_000, 107_000_000]
 
 
+@pytest.mark.parametrize(
+    ("heading", "line"),
+    [
+        ("#timestamp [ns],filename", "{ns},{name}"),  # EuRoC
+        ("filename,timestamp", "{name},{seconds}"),
+        ("", "{seconds},{name}"),
+        ("", "{name},{ns}"),
+    ],
+)
+def test_columns_in_either_order_and_stamps_in_either_unit(tmp_path: Path, heading: str, line: str) -> None:
+    """Names that are themselves numbers are told from stamps by the files that are there."""
+    images = tmp_path / "images"
+    images.mkdir()
+    stamps = [1_700_000_000_000_000_000 + 100_000_000 * k for k in range(3)]
+    lines = [heading] if heading else []
+    for k, stamp in enumerate(stamps):
+        name, seconds = f"{k:06d}.png", f"{stamp // 10**9}.{stamp % 10**9:09d}"
+        (images / name).write_bytes(b"")
+        lines.append(line.format(ns=stamp, name=name, seconds=seconds))
+    (tmp_path / "images.csv").write_text("\n".join(lines) + "\n")
+    files = stamped_files(images, (".png",))
+    assert files.stamps_ns.tolist() == stamps
+    assert [path.name for path in files.paths] == ["000000.png", "000001.png", "000002.png"]
+
+
 def test_a_table_with_quotes(tmp_path: Path) -> None:
     """Commas and quotes in names, a byte order mark, and lines that end as on Windows."""
     images = tmp_path / "images"
@@ -276,7 +301,7 @@ def test_a_table_with_quotes(tmp_path: Path) -> None:
     assert [path.name for path in found.paths] == names
     assert found.stamps_ns.tolist() == [1_000_000_000, 2_000_000_000, 3_000_000_000]
     table.write_text('"3.png,1000000000\n')
-    with pytest.raises(DataError, match=r"images.csv:1: found .*, expected name,stamp_ns"):
+    with pytest.raises(DataError, match=r"images.csv:1: found .*, expected name,stamp or stamp,name"):
         stamped_files(images, (".png",))
     table.write_text(f"3.png,{2**63 - 1}\n")
     with pytest.raises(DataError, match=f"expected nanoseconds, at most {2**62}"):
