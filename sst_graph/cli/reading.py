@@ -24,7 +24,7 @@ from sst_graph.files.typed_values import matches
 from sst_graph.result import CalibrationResult, result_file
 from sst_graph.types import Source
 
-PAIRING = ("image_shift", "camera", "image_topic", "info_topic", "stamps")
+PAIRING = ("image_shift", "camera", "image_topic", "info_topic", "camera_file", "stamps")
 """Options without which a result means something else: they may not be contradicted."""
 
 OF_A_TURN = ("sweep_start_deg", "sweep_stamp")

@@ -58,6 +58,7 @@ class SourceOptions:
         sweep_stamp: the instant that a scan's stamp names where times follow from azimuths.
         image_topic, cloud_topic, info_topic: of a bag: topics of the camera, the LiDAR and the camera model,
             or None for the only ones there.
+        camera_file: of a bag: the camera in a YAML file, in the place of a CameraInfo.
         mask_topic: of a bag: topic of semantic masks with the stamps of their images. With it the labels in
             the cloud are read, too. None: no labels.
         stamps: of a bag: "header" as the sensors' drivers stamp, or "received" by the recorder, for drivers
@@ -76,6 +77,7 @@ class SourceOptions:
     image_topic: str | None = None
     cloud_topic: str | None = None
     info_topic: str | None = None
+    camera_file: str | None = None
     mask_topic: str | None = None
     stamps: Stamps = "header"
 
@@ -127,7 +129,7 @@ class SourceOptions:
         return SweepTiming(TURNS[self.sweep], start_rad, period_s, self.sweep_stamp)
 
 
-BAG_OPTIONS = ("image_topic", "cloud_topic", "info_topic", "mask_topic", "stamps")
+BAG_OPTIONS = ("image_topic", "cloud_topic", "info_topic", "camera_file", "mask_topic", "stamps")
 """Options that only bags have."""
 
 
@@ -228,6 +230,7 @@ class ReadOptions(TypedDict, total=False):
     image_topic: str | None
     cloud_topic: str | None
     info_topic: str | None
+    camera_file: str | None
     mask_topic: str | None
     stamps: Stamps
 

@@ -237,6 +237,27 @@ def test_cameras_of_other_tools(folder: Path, kind: str) -> None:
             open_source(folder)
 
 
+def test_a_camera_is_found_in_a_chain_by_its_name_or_topic(tmp_path: Path) -> None:
+    file = tmp_path / "camera.yaml"
+    one = "{{intrinsics: [{}, 30, 16, 12], resolution: [32, 24], rostopic: {}}}\n"
+    file.write_text(
+        "cam0: " + one.format(30, "/left/image_raw") + "cam1: " + one.format(31, "/right/image_raw")
+    )
+    for name, fx in {
+        "": 30.0,
+        "cam1": 31.0,
+        "/right/image_raw": 31.0,
+        "/right/image_raw/compressed": 31.0,
+        "/right/image_mono": 31.0,
+        "left": 30.0,
+    }.items():
+        assert read_camera(file, name).intrinsics.fx == fx, name
+    with pytest.raises(DataError, match=r"cameras cam0 \(/left/image_raw\), .*, expected one of .* front"):
+        read_camera(file, "front")
+    file.write_text("cam1: " + one.format(31, "/right/image_raw"))
+    assert read_camera(file).intrinsics.fx == read_camera(file, "front").intrinsics.fx == 31.0
+
+
 def test_an_extrinsic_as_translation_and_quaternion(folder: Path) -> None:
     (folder / "extrinsic.yaml").write_text("translation: [1, 2, 3]\nquaternion: [0.5, -0.5, 0.5, -0.5]\n")
     nominal = open_source(folder).nominal

@@ -119,7 +119,7 @@ def open_folder(path: Path, options: SourceOptions) -> Source:
         if files.without_stamp:
             found = count_of(files.without_stamp, what.removesuffix("s"))
             _LOG.warning("%s: %s without a stamp left out", printable(path), found)
-    model = read_camera(own / _CAMERA)
+    model = read_camera(own / _CAMERA, "" if own == path else options.camera)
     extrinsic = own / _EXTRINSIC
     nominal = read_extrinsic(extrinsic) if os.path.lexists(extrinsic) else None
     size = (model.width, model.height)

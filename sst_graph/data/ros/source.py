@@ -17,14 +17,15 @@ from sst_graph.classes import MaskEncoding, guess_mask_encoding
 from sst_graph.data.arrays import listed
 from sst_graph.data.rectified import RectifiedSource
 from sst_graph.data.ros.bag import Bag, Topic
-from sst_graph.data.ros.camera_info import image_geometry
+from sst_graph.data.ros.camera_info import ImageGeometry, geometry_by_file, has_matrix, image_geometry
 from sst_graph.data.ros.frames import CloudReading, check_size, mask_classes, scan_of
 from sst_graph.data.ros.images import mask_of, picture_of
 from sst_graph.data.ros.index import BagIndex, Stamped, read_index
 from sst_graph.data.ros.topics import Topics, choose_topics
 from sst_graph.data.source import Loader, SourceOptions
 from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
-from sst_graph.errors import DataError, count_of, printable
+from sst_graph.errors import ConfigError, DataError, count_of, printable
+from sst_graph.files.reading import path_of
 from sst_graph.sampling import evenly_spread
 from sst_graph.sweep_timing import SweepTiming
 from sst_graph.types import CameraImage, Scan, SemanticClass, Source
@@ -143,17 +144,17 @@ def open_ros(path: Path, options: SourceOptions) -> Source:
     index = read_index(bag, topics, options.stamps)
     _check_masks(bag, index)
     size = _size(bag, topics, index)
-    geometry = image_geometry(index.info, topics.image.name, size, f"{path}, {topics.info.name}")
+    geometry = _geometry(path, topics, index, size, options)
     oTl, reason = index.transforms.pose(index.image_frame, index.cloud_frame)
     nominal = None if oTl is None else geometry.extrinsic(oTl)
     if nominal is None:
         _LOG.info("%s: no nominal extrinsic: %s", printable(path), reason)
     encoding, timing = _encoding(bag, topics, index, options), options.timing(_stamps(index.clouds))
     messages = BagMessages(bag, topics, index, size, encoding, timing, options.sweep == "auto")
-    notes = [f"camera model from {topics.info.name}"]
+    notes = [f"camera model from {topics.info.name if topics.info else options.camera_file}"]
     if index.repeated:
         notes.append(f"left out {count_of(index.repeated, 'message')} with the stamp of another")
-    if index.other_infos:
+    if topics.info is not None and index.other_infos:
         others = count_of(index.other_infos, "CameraInfo", "CameraInfo")
         notes.append(f"{others} of {topics.info.name} of another camera than the first, whose model is taken")
         _LOG.warning("%s: %s", printable(path), notes[-1])
@@ -184,6 +185,22 @@ def _check_masks(bag: Bag, index: BagIndex) -> None:
         expected = f"the stamps of their images, such as {index.images[0].stamp_ns} ns"
         place = f"{bag.path}, {first.message.topic}"
         raise DataError(place, f"masks at other stamps, such as {first.stamp_ns} ns", expected)
+
+
+def _geometry(
+    path: Path, topics: Topics, index: BagIndex, size: tuple[int, int], options: SourceOptions
+) -> ImageGeometry:
+    """Of the images: by the file that the options name, or by their CameraInfo."""
+    if options.camera_file is not None:
+        if options.info_topic is not None:
+            raise ConfigError(f"--info-topic {options.info_topic}: means nothing with --camera-file")
+        return geometry_by_file(path_of(options.camera_file, "a camera"), topics.image.name, size)
+    assert topics.info is not None
+    place = f"{path}, {topics.info.name}"
+    if not has_matrix(index.info):
+        expected = "a calibrated one, or its file (--camera-file)"
+        raise DataError(place, "K = 0, an uncalibrated camera", expected)
+    return image_geometry(index.info, topics.image.name, size, place)
 
 
 def _size(bag: Bag, topics: Topics, index: BagIndex) -> tuple[int, int]:

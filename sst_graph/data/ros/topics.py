@@ -25,14 +25,15 @@ class Topics:
     """Topics that a drive is read from.
 
     Attributes:
-        image, cloud, info: of the camera, the LiDAR and the camera's model.
+        image, cloud: of the camera and the LiDAR.
+        info: of the camera's model; None where a file has it.
         mask: of the semantic masks, or None.
         transforms: names of those with TFMessage.
     """
 
     image: Topic
     cloud: Topic
-    info: Topic
+    info: Topic | None
     mask: Topic | None
     transforms: tuple[str, ...]
 
@@ -64,7 +65,7 @@ def choose_topics(path: Path, topics: Mapping[str, Topic], options: SourceOption
     return Topics(
         image=image,
         cloud=_one(path, filled, options.cloud_topic, "--cloud-topic", (CLOUD,)),
-        info=_info(path, filled, options.info_topic, image),
+        info=None if options.camera_file is not None else _info(path, filled, options.info_topic, image),
         mask=mask,
         transforms=tuple(name for name, topic in filled.items() if topic.type in _TRANSFORMS),
     )
@@ -107,6 +108,9 @@ def _info(path: Path, topics: Mapping[str, Topic], name: str | None, image: Topi
         beside = topics.get(_namespace(image.name) + "/camera_info")
         if beside is not None and beside.type == INFO:
             return beside
+    if name is None and not any(topic.type == INFO for topic in topics.values()):
+        found = f"no topic of {INFO} among {listed(topics.values())}"
+        raise DataError(path, found, "one, or the camera in a file (--camera-file)")
     return _one(path, topics, name, "--info-topic", (INFO,))
 
 

@@ -173,6 +173,55 @@ def test_images_of_a_lens_that_distorts_are_rectified(tmp_path: Path) -> None:
     assert pictures and all((picture == rectification.picture(PIXELS)).all() for picture in pictures)
 
 
+PLAIN = "fx: 31\nfy: 32\ncx: 16\ncy: 12\nwidth: 32\nheight: 24\n"
+LENS = "distortion_model: plumb_bob\ndistortion: [-0.1, 0, 0, 0]\n"
+CHAIN = """
+cam0: {intrinsics: [30, 30, 16, 12], resolution: [32, 24], rostopic: /rear/image_raw}
+cam1: {intrinsics: [31, 32, 16, 12], resolution: [32, 24], rostopic: %s}
+"""
+
+
+def test_a_file_stands_in_the_place_of_a_missing_or_empty_camera_info(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def without_calibration(bag: BagWriter) -> None:
+        bag.add(INFO, bag.messages.info(CAMERA, k=np.zeros(9), p=np.zeros(12)), EPOCH_NS)
+        fill(bag, leave_out=[INFO])
+
+    (tmp_path / "a").mkdir()
+    missing = made(tmp_path / "a", lambda bag: fill(bag, leave_out=[INFO]))
+    assert "the camera in a file (--camera-file)" in refused(capsys, missing)
+    empty = made(tmp_path, without_calibration)
+    assert "K = 0, an uncalibrated camera, expected a calibrated one, or its file" in refused(capsys, empty)
+    file = tmp_path / "camera.yaml"
+    for bag in (missing, empty):
+        for text in (PLAIN, CHAIN % IMAGE, CHAIN % "/front/image_raw/compressed"):
+            file.write_text(text)
+            source = open_source(bag, camera_file=str(file))
+            assert source.camera == PinholeCamera(31.0, 32.0, 16.0, 12.0, 32, 24)
+    assert main(["info", str(missing), "--camera-file", str(file)]) == 0
+    assert f"camera model from {file}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (PLAIN.replace("32\nh", "64\nh"), "64x24 px, expected 32x24 px, the size of the images"),
+        (PLAIN + LENS, "a plumb_bob lens for /front/image_rect, whose name says"),
+        (CHAIN % "/left/image_raw", "cam0 (/rear/image_raw), cam1 (/left/image_raw), expected one of"),
+        ("a: 1\n", "found keys a, expected fx, fy, cx, cy"),
+    ],
+)
+def test_files_that_are_not_the_camera_of_the_images(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, words: str
+) -> None:
+    path, file = made(tmp_path, fill), tmp_path / "camera.yaml"
+    file.write_text(text)
+    assert words in refused(capsys, path, "--camera-file", str(file))
+    found = refused(capsys, path, "--camera-file", str(file), "--info-topic", INFO)
+    assert f"--info-topic {INFO}: means nothing with --camera-file" in found
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_camera_whose_model_changes_is_reported(
     tmp_path: Path, kind: Kind, caplog: pytest.LogCaptureFixture
