@@ -33,6 +33,8 @@ LABEL_ENCODINGS: tuple[LabelEncoding, ...] = get_args(LabelEncoding)
 _CHOSEN = ("label_encoding", "sweep", "sweep_stamp", "stamps")
 _EXPECTED = {"frames": "A:B, or a slice", "image_shift": "a whole number", "sweep_start_deg": "a number"}
 """What an option is, where it is no text."""
+_LISTED = 5
+"""Names in a folder that an error lists at most."""
 _MOST_FRAMES = 2**62
 """Numbers of frames are below."""
 
@@ -268,8 +270,15 @@ def open_source(
     found = recognized(path)
     if found is None:
         layouts = [find_loader(name).layout for name in loader_names()]
-        raise DataError(path, "no layout that is known", "; or ".join(layouts))
+        raise DataError(path, f"no layout that is known{_content(path)}", "; or ".join(layouts))
     return find_loader(found).opened(path, chosen)
+
+
+def _content(path: Path) -> str:
+    """What a folder holds, in words; empty where it holds nothing or is a file."""
+    names = sorted(entry.name for entry in path.iterdir()) if path.is_dir() else []
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return f" in a folder of {', '.join(names[:_LISTED])}{more}" if names else ""
 
 
 def recognized(path: Path) -> str | None:

@@ -35,7 +35,7 @@ from sst_graph.types import CameraImage, GroundTruth, Scan, SemanticClass, Sourc
 
 _LOG = logging.getLogger(__name__)
 
-LAYOUT = "nuScenes: PATH with v1.0-* (tables), samples and sweeps"
+LAYOUT = "nuScenes: PATH with v1.0-*, samples, sweeps"
 _LIDAR, _CAMERA = "LIDAR_TOP", "CAM_FRONT"
 _NS_PER_US = 1000
 _PCD_BIN = FileKind("a nuScenes cloud of x y z intensity ring in float32", 20 * MAX_POINTS)

@@ -32,7 +32,7 @@ from sst_graph.types import CameraImage, Scan, SemanticClass, Source
 
 _LOG = logging.getLogger(__name__)
 
-LAYOUT = "a bag: PATH.bag (ROS 1), PATH.mcap, PATH.db3, or a rosbag2 folder with metadata.yaml"
+LAYOUT = "a bag: PATH.bag, PATH.mcap, PATH.db3, or a rosbag2 folder"
 
 _SUFFIXES, _METADATA = (".bag", ".mcap", ".db3"), "metadata.yaml"
 _MASKS_TO_JUDGE = 8
