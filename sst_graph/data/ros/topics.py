@@ -99,7 +99,8 @@ def _one(
     if not fitting:
         raise DataError(path, f"no topic of {what} among {listed(topics.values())}", "one")
     masks = [topic.name for topic in fitting if any(word in topic.name for word in _MASK_WORDS)]
-    hint = f"; of masks by --mask-topic {masks[0]}" if masks else ""
+    hint = "; several cameras by --camera" if option == "--image-topic" else ""
+    hint = f"; of masks by --mask-topic {masks[0]}" if masks else hint
     raise DataError(path, f"several topics of {what}: {listed(fitting)}", f"one, named by {option}{hint}")
 
 

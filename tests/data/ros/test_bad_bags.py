@@ -78,7 +78,7 @@ def test_two_image_topics_are_listed_and_one_is_chosen(
     path = made(tmp_path, fill, rear)
     line = refused(capsys, path)
     assert "/front/image_rect (sensor_msgs/Image, 4), /rear/image (sensor_msgs/Image, 1)" in line
-    assert line.endswith("expected one, named by --image-topic")
+    assert line.endswith("expected one, named by --image-topic; several cameras by --camera")
     assert main(["info", str(path), "--image-topic", "/rear/image"]) == 0
     assert "1 in /rear/image" in capsys.readouterr().out
 
