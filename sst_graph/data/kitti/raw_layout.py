@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.data.arrays import check_stamped, listed, numbered_files, optional_files
-from sst_graph.data.kitti.raw_calib import CAM_TO_CAM, VELO_TO_CAM
+from sst_graph.data.kitti.raw_calib import CAM_TO_CAM
 from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.files.reading import FileKind, read_text
 from sst_graph.timestamps import MAX_STAMPS, NS_PER_S, check_rising, checked_ns

@@ -1,4 +1,4 @@
-"""Points, laser numbers, times and labels of sensor_msgs/PointCloud2."""
+"""Points, laser numbers, times and labels of sensor_msgs/PointCloud2, and of Livox's CustomMsg."""
 
 from __future__ import annotations
 
@@ -43,6 +43,7 @@ def cloud_of(message: Any, stamp_ns: int, place: str, times: bool = True, labels
     """The cloud of a message.
 
     Args:
+        message: a PointCloud2, or the points of a CustomMsg (n,) by field.
         stamp_ns: the header's stamp.
         times: read the times of the points, where the message has them.
         labels: read the fields ``label`` and ``instance``, where the message has them.
@@ -52,7 +53,8 @@ def cloud_of(message: Any, stamp_ns: int, place: str, times: bool = True, labels
     """
     # What has no value as a float of 32 bits becomes inf, and is left out.
     with np.errstate(over="ignore", invalid="ignore"):
-        return _cloud(_table(message, place), stamp_ns, place, times, labels)
+        table = message if isinstance(message, np.ndarray) else _table(message, place)
+        return _cloud(table, stamp_ns, place, times, labels)
 
 
 def _cloud(table: NDArray[Any], stamp_ns: int, place: str, times: bool, labels: bool) -> Cloud:

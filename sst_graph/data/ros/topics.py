@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sst_graph.data.ros.bag import TF_MESSAGE, Topic
+from sst_graph.data.ros.livox import CUSTOM
 from sst_graph.data.source import SourceOptions
 from sst_graph.errors import DataError
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CLOUD, INFO = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/CameraInfo"
 
-_TRANSFORMS = (TF_MESSAGE, "tf/msg/tfMessage")
 _LISTED = 12
 """Topics that an error lists at most."""
 _MASK_WORDS = ("mask", "label", "semantic", "segment")
@@ -64,10 +64,10 @@ def choose_topics(path: Path, topics: Mapping[str, Topic], options: SourceOption
         mask = _named(path, filled, name, kinds, "--mask-topic")
     return Topics(
         image=image,
-        cloud=_one(path, filled, options.cloud_topic, "--cloud-topic", (CLOUD,)),
+        cloud=_one(path, filled, options.cloud_topic, "--cloud-topic", (CLOUD, CUSTOM)),
         info=None if options.camera_file is not None else _info(path, filled, options.info_topic, image),
         mask=mask,
-        transforms=tuple(name for name, topic in filled.items() if topic.type in _TRANSFORMS),
+        transforms=tuple(name for name, topic in filled.items() if topic.type == TF_MESSAGE),
     )
 
 
