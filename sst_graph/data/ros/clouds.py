@@ -57,6 +57,13 @@ def cloud_of(message: Any, stamp_ns: int, place: str, times: bool = True, labels
         return _cloud(table, stamp_ns, place, times, labels)
 
 
+def field_names(message: Any) -> tuple[str, ...]:
+    """Names of all fields of a message, whether they are understood or not."""
+    if isinstance(message, np.ndarray):
+        return message.dtype.names or ()
+    return tuple(str(field.name) for field in message.fields)
+
+
 def _cloud(table: NDArray[Any], stamp_ns: int, place: str, times: bool, labels: bool) -> Cloud:
     points = np.stack([np.asarray(table[axis], np.float64) for axis in "xyz"], axis=1).astype(np.float32)
     # Drivers give NaN or the origin for beams without a return.

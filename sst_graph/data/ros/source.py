@@ -18,6 +18,7 @@ from sst_graph.data.arrays import listed
 from sst_graph.data.rectified import RectifiedSource
 from sst_graph.data.ros.bag import Bag, Topic
 from sst_graph.data.ros.camera_info import ImageGeometry, geometry_by_file, has_matrix, image_geometry
+from sst_graph.data.ros.clouds import field_names
 from sst_graph.data.ros.frames import CloudReading, check_size, mask_classes, scan_of
 from sst_graph.data.ros.images import mask_of, picture_of
 from sst_graph.data.ros.index import BagIndex, Stamped, read_index
@@ -152,6 +153,7 @@ def open_ros(path: Path, options: SourceOptions) -> Source:
     encoding, timing = _encoding(bag, topics, index, options), options.timing(_stamps(index.clouds))
     messages = BagMessages(bag, topics, index, size, encoding, timing, options.sweep == "auto")
     notes = [f"camera model from {topics.info.name if topics.info else options.camera_file}"]
+    notes.append(f"fields of the clouds: {', '.join(_fields(bag, topics, index))}")
     if index.repeated:
         notes.append(f"left out {count_of(index.repeated, 'message')} with the stamp of another")
     if topics.info is not None and index.other_infos:
@@ -210,6 +212,11 @@ def _size(bag: Bag, topics: Topics, index: BagIndex) -> tuple[int, int]:
         _read(bag, topics, index, first, type_name), type_name, _place(bag, first)
     ).shape[:2]
     return width, height
+
+
+def _fields(bag: Bag, topics: Topics, index: BagIndex) -> tuple[str, ...]:
+    """Names of what the first cloud holds for each point."""
+    return field_names(_read(bag, topics, index, index.clouds[0], topics.cloud.type))
 
 
 def _encoding(bag: Bag, topics: Topics, index: BagIndex, options: SourceOptions) -> MaskEncoding | None:

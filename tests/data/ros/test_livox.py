@@ -14,6 +14,7 @@ from bags import EPOCH_NS, IMAGE, INFO, KINDS, Kind, Messages, writing
 from rosbags.typesys import get_types_from_msg
 
 from sst_graph.data import open_source
+from sst_graph.data.info import drive_info
 from sst_graph.data.ros.livox import CUSTOM, OLDER_CUSTOM, custom_points
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
@@ -80,6 +81,10 @@ def test_a_bag_of_them_is_a_drive(kind: Kind, name: str, tmp_path: Path) -> None
         bag.add(INFO, make.info(CAMERA, EPOCH_NS), EPOCH_NS)
         bag.add(IMAGE, make.image(EPOCH_NS, np.full((24, 32, 3), 60, np.uint8)), EPOCH_NS)
         bag.add("/livox/lidar", sent, EPOCH_NS)
+    assert (
+        "of the clouds: offset_time, x, y, z, reflectivity, tag, line"
+        in drive_info(open_source(path)).notes[1]
+    )
     scan = open_source(path)[0].scan
     assert scan is not None and scan.stamp_ns == EPOCH_NS and scan.left_out == 1
     np.testing.assert_array_equal(scan.points[:, 1], np.array([p.y for p in sent.points[1:]], np.float32))
