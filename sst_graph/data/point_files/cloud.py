@@ -122,7 +122,8 @@ def cloud_of(path: Path, fields: Mapping[str, NDArray[Any]]) -> Cloud:
     Raises:
         DataError: no x, y, z, a field of other than numbers, or fields of other lengths.
     """
-    lower = {name.lower(): values for name, values in fields.items()}
+    # CloudCompare puts "scalar_" before all but coordinates and colours.
+    lower = {name.lower().removeprefix("scalar_"): values for name, values in fields.items()}
     missing = [name for name in "xyz" if name not in lower]
     if missing:
         named = ", ".join(sorted(fields)) or "none"
