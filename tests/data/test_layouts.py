@@ -57,6 +57,21 @@ def test_a_folder_brings_the_frames_of_kitti_odometry(kitti_drive: Path, tmp_pat
     assert_same_drive(source, open_source(kitti_drive))
 
 
+def test_every_layout_says_where_its_start_comes_from(kitti_drive: Path, tmp_path: Path) -> None:
+    folder = as_folder(kitti_drive, tmp_path / "street")
+    for drive, reason in {
+        kitti_drive: "by calib.txt",
+        as_kitti_raw(kitti_drive, tmp_path / "raw"): "by calib_velo_to_cam.txt and calib_cam_to_cam.txt",
+        as_nuscenes(kitti_drive, tmp_path / "nuscenes"): "by calibrated_sensor.json",
+        folder: "by extrinsic.yaml",
+    }.items():
+        sequence = "61" if reason == "by calibrated_sensor.json" else None
+        assert drive_info(open_source(drive, sequence=sequence)).nominal_reason == reason
+    (folder / "extrinsic.yaml").unlink()
+    info = drive_info(open_source(folder))
+    assert not info.nominal and info.nominal_reason == "no extrinsic.yaml"
+
+
 def test_files_that_macos_leaves_are_no_frames(kitti_drive: Path, tmp_path: Path) -> None:
     folder = as_folder(kitti_drive, tmp_path / "folder")
     count = len(open_source(folder))
