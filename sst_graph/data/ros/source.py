@@ -102,7 +102,12 @@ def is_ros(path: Path) -> bool:
     """Whether a path is a bag, or a folder of some."""
     if path.is_file():
         return path.suffix in _SUFFIXES
-    return (path / _METADATA).is_file() or bool(_bag_files(path))
+    return (path / _METADATA).is_file() or is_folder_of_bags(path)
+
+
+def is_folder_of_bags(path: Path) -> bool:
+    """Whether bags stand in a folder by themselves: one drive or several, nothing says it."""
+    return path.is_dir() and not (path / _METADATA).is_file() and bool(_bag_files(path))
 
 
 def _bag_files(path: Path) -> list[Path]:
