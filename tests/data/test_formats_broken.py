@@ -254,6 +254,10 @@ def test_a_camera_is_found_in_a_chain_by_its_name_or_topic(tmp_path: Path) -> No
         assert read_camera(file, name).intrinsics.fx == fx, name
     with pytest.raises(DataError, match=r"cameras cam0 \(/left/image_raw\), .*, expected one of .* front"):
         read_camera(file, "front")
+    unnamed = "{intrinsics: [30, 30, 16, 12], resolution: [32, 24]}\n"
+    file.write_text("cam1: " + one.format(31, "/right/image_raw") + "cam2: " + unnamed)
+    with pytest.raises(DataError, match="expected one of the name or rostopic cam0"):
+        read_camera(file)
     file.write_text("cam1: " + one.format(31, "/right/image_raw"))
     assert read_camera(file).intrinsics.fx == read_camera(file, "front").intrinsics.fx == 31.0
 

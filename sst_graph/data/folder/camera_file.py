@@ -70,7 +70,7 @@ def _of_chain(chain: Mapping[str, Any], name: str, path: Path) -> str:
     if len(topics) == 1 or (not name and "cam0" in topics):
         return min(topics)
     topic = name.removesuffix("/compressed")
-    for same in (topic, topic.rpartition("/")[0] or topic):
+    for same in filter(None, (topic, topic.rpartition("/")[0])):
         found = [key for key, own in topics.items() if same.strip("/") in (key, _plain(own), _space(own))]
         if len(found) == 1:
             return found[0]
