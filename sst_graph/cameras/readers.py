@@ -42,14 +42,18 @@ def camera_of(
 ) -> CameraModel:
     """The model of a distortion's name and coefficients, in OpenCV's order.
 
-    Coefficients that are all 0 make a pinhole, but not of a fisheye: an ideal one is none.
+    Coefficients that are all 0 make a pinhole, but not of a fisheye: an ideal one is none. Zeros behind the
+    most coefficients that a model has are padding, as drivers with arrays of one length write it.
 
     Raises:
         DataError: an unknown name, a number of coefficients that does not go with it, intrinsics that do not
             go with the size of the image.
     """
     intrinsics = checked_camera(intrinsics, place)
-    values, name = tuple(float(value) for value in coefficients), distortion.lower()
+    name = distortion.lower()
+    most = 4 if name in _FISHEYE else max(_BROWN_CONRADY.get(name, (0,)))
+    values = tuple(float(value) for value in coefficients)
+    values = values[:most] if most and not any(values[most:]) else values
     if not (np.abs(values) <= LARGEST_COEFFICIENT).all():
         expected = f"finite numbers of at most {LARGEST_COEFFICIENT:g}"
         raise DataError(place, f"distortion coefficients {values}", expected)

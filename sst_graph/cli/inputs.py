@@ -13,6 +13,7 @@ import gtsam
 from sst_graph.cli.messages import complain
 from sst_graph.cli.reading import open_drive
 from sst_graph.config import read_config, with_overrides
+from sst_graph.data.info.facts import facts_of
 from sst_graph.errors import ConfigError
 from sst_graph.imports import ImportOptions, import_calibration
 from sst_graph.types import SemanticClass, Source
@@ -62,7 +63,10 @@ def starting_point(choice: str, source: Source, camera: str) -> tuple[gtsam.Pose
             complain(f"note: --init {choice}: {start.words()}")
         return start.cTl, start.time_offset_s or 0.0
     if source.nominal is None:
-        raise ConfigError(f"{source.name} brings no nominal calibration: give --init none or --init FILE")
+        facts = facts_of(source)
+        why = f" ({facts.nominal})" if facts is not None and facts.nominal else ""
+        found = f"{source.name} brings no nominal calibration{why}"
+        raise ConfigError(f"{found}: give --init none or --init FILE")
     return source.nominal, 0.0
 
 

@@ -17,14 +17,14 @@ from sst_graph.cli.labels import LABEL_OPTIONS, labelled
 from sst_graph.cli.messages import complain
 from sst_graph.cli.options import SOURCE_DEFAULTS
 from sst_graph.data import open_source
-from sst_graph.data.info.facts import FactsReader
+from sst_graph.data.info.facts import facts_of
 from sst_graph.data.source import source_options
 from sst_graph.errors import ConfigError, DataError, SstGraphError
 from sst_graph.files.typed_values import matches
 from sst_graph.result import CalibrationResult, result_file
 from sst_graph.types import Source
 
-PAIRING = ("image_shift", "camera", "image_topic", "info_topic", "stamps", "lidar_pose")
+PAIRING = ("image_shift", "camera", "image_topic", "info_topic", "camera_file", "stamps", "lidar_pose")
 """Options without which a result means something else: they may not be contradicted."""
 
 OF_A_TURN = ("sweep_start_deg", "sweep_stamp")
@@ -48,7 +48,8 @@ def with_image_topic(read_as: Mapping[str, Any], sources: Sequence[Source]) -> d
     """``read_as`` with the topic of the images where none was named and all drives have them on the same."""
     if read_as["image_topic"] is not None:
         return dict(read_as)
-    topics = {one.facts().image.topic if isinstance(one, FactsReader) else "" for one in sources}
+    facts = [facts_of(source) for source in sources]
+    topics = {"" if one is None else one.image.topic for one in facts}
     return {**read_as, "image_topic": topics.pop() or None if len(topics) == 1 else None}
 
 

@@ -34,6 +34,8 @@ LABEL_ENCODINGS: tuple[LabelEncoding, ...] = get_args(LabelEncoding)
 _CHOSEN = ("label_encoding", "sweep", "sweep_stamp", "stamps")
 _EXPECTED = {"frames": "A:B, or a slice", "image_shift": "a whole number", "sweep_start_deg": "a number"}
 """What an option is, where it is no text."""
+_LISTED = 5
+"""Names in a folder that an error lists at most."""
 _MOST_FRAMES = 2**62
 """Numbers of frames are below."""
 
@@ -59,6 +61,7 @@ class SourceOptions:
         sweep_stamp: the instant that a scan's stamp names where times follow from azimuths.
         image_topic, cloud_topic, info_topic: of a bag: topics of the camera, the LiDAR and the camera model,
             or None for the only ones there.
+        camera_file: of a bag: the camera in a YAML file, in the place of a CameraInfo.
         mask_topic: of a bag: topic of semantic masks with the stamps of their images. With it the labels in
             the cloud are read, too. None: no labels.
         stamps: of a bag: "header" as the sensors' drivers stamp, or "received" by the recorder, for drivers
@@ -80,6 +83,7 @@ class SourceOptions:
     image_topic: str | None = None
     cloud_topic: str | None = None
     info_topic: str | None = None
+    camera_file: str | None = None
     mask_topic: str | None = None
     stamps: Stamps = "header"
     lidar_pose: str | None = None
@@ -139,7 +143,7 @@ class SourceOptions:
         return SweepTiming(TURNS[self.sweep], start_rad, period_s, self.sweep_stamp)
 
 
-BAG_OPTIONS = ("image_topic", "cloud_topic", "info_topic", "mask_topic", "stamps")
+BAG_OPTIONS = ("image_topic", "cloud_topic", "info_topic", "camera_file", "mask_topic", "stamps")
 """Options that only bags have."""
 
 
@@ -243,6 +247,7 @@ class ReadOptions(TypedDict, total=False):
     image_topic: str | None
     cloud_topic: str | None
     info_topic: str | None
+    camera_file: str | None
     mask_topic: str | None
     stamps: Stamps
     lidar_pose: str | None
@@ -281,8 +286,15 @@ def open_source(
     found = recognized(path)
     if found is None:
         layouts = [find_loader(name).layout for name in loader_names()]
-        raise DataError(path, "no layout that is known", "; or ".join(layouts))
+        raise DataError(path, f"no layout that is known{_content(path)}", "; or ".join(layouts))
     return find_loader(found).opened(path, chosen)
+
+
+def _content(path: Path) -> str:
+    """What a folder holds, in words; empty where it holds nothing or is a file."""
+    names = sorted(entry.name for entry in path.iterdir()) if path.is_dir() else []
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return f" in a folder of {', '.join(names[:_LISTED])}{more}" if names else ""
 
 
 def recognized(path: Path) -> str | None:

@@ -78,6 +78,15 @@ def test_camera_info_of_both_ros() -> None:
             {"d": (0.0,) * 4, "distortion_model": "equidistant"},
             FisheyeCamera(INTRINSICS, (0.0,) * 4),
         ),
+        # Arrays of one length, whatever the model.
+        (
+            {"d": (0.01, 0.02, 0.0, 0.0, 0.0), "distortion_model": "equidistant"},
+            FisheyeCamera(INTRINSICS, (0.01, 0.02, 0.0, 0.0)),
+        ),
+        (
+            {"d": (-0.1, 0.02, 0.0, 0.0, 0.01, 0.0, 0.0, 0.0)},
+            BrownConradyCamera(INTRINSICS, (-0.1, 0.02, 0.0, 0.0, 0.01)),
+        ),
     ],
 )
 def test_distortion_models_of_ros(changes: dict[str, Any], expected: object) -> None:
@@ -92,6 +101,7 @@ def test_distortion_models_of_ros(changes: dict[str, Any], expected: object) -> 
         ({"roi": {"x_offset": 0, "y_offset": 100, "width": 1280, "height": 500}}, "region of interest"),
         ({"distortion_model": "mei"}, "found distortion model 'mei', expected one of plumb_bob"),
         ({"distortion_model": ""}, "5 distortion coefficients without the name of a model"),
+        ({"d": (0.1,) * 8}, "found 8 coefficients of plumb_bob, expected 4 or 5"),
         ({"d": (0.1,) * 7}, "found 7 coefficients of plumb_bob, expected 4 or 5"),
         ({"d": (0.1,) * 14, "distortion_model": "rational_polynomial"}, "tilted sensor"),
         ({"d": (np.nan,) * 5}, "NaN or inf"),

@@ -45,6 +45,19 @@ def test_a_drive_in_the_place_of_a_folder_of_drives_is_told(
     assert "looks like one drive" not in capsys.readouterr().err
 
 
+def test_a_folder_of_bags_is_a_folder_of_drives(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Without metadata.yaml; with it, the folder is one bag, and that is said."""
+    folder = tmp_path / "day"
+    folder.mkdir()
+    for name in ("a.mcap", "b.mcap"):
+        (folder / name).write_bytes(b"no bag")
+    main(["batch", str(folder), "--out", str(tmp_path / "out")])
+    assert "looks like one drive" not in capsys.readouterr().err
+    (folder / "metadata.yaml").touch()
+    main(["batch", str(folder), "--out", str(tmp_path / "again")])
+    assert f"note: {folder} looks like one drive (ros)" in capsys.readouterr().err
+
+
 def test_loose_files_are_named_once_and_a_long_reason_is_short_on_the_terminal(
     drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -192,11 +192,16 @@ def test_unknown_options_are_refused(drive: Path, options: dict[str, Any]) -> No
 def test_paths_without_a_drive_are_refused(tmp_path: Path) -> None:
     (tmp_path / "sequences").mkdir()
     (tmp_path / "file").write_text("x")
-    (tmp_path / "empty").mkdir()
+    for name in ("empty", "full"):
+        (tmp_path / name).mkdir()
+    for k in range(7):
+        (tmp_path / "full" / f"{k}.txt").touch()
     for path, message in [
         (tmp_path / "absent", "found no file or folder"),
         (tmp_path / "file", "found no layout that is known, expected KITTI odometry"),
         (tmp_path / "empty", "found no layout that is known, expected KITTI odometry"),
+        (tmp_path / "full", "known in a folder of 0.txt, 1.txt, 2.txt, 3.txt, 4.txt and 2 more, expected"),
+        (tmp_path / "full", "; or a bag: PATH.bag, PATH.mcap, PATH.db3, or a rosbag2 folder$"),
         (tmp_path, "sequences: found an empty folder"),
     ]:
         with pytest.raises(DataError, match=message):

@@ -152,7 +152,7 @@ BROKEN: list[tuple[str, Change, str]] = [
     ("folder", write("images/first.png", b""), "the name 'first', expected a stamp"),
     ("folder", write("images.csv", "a.png,100\n"), "'a.png', expected the name of a file in images"),
     ("folder", write("images.csv", "name,stamp_ns\n"), "no stamp"),
-    ("folder", write("images.csv", "0.png,1.5\n"), "'0.png,1.5', expected name,stamp_ns"),
+    ("folder", write("images.csv", "0.png,1e9\n"), "'0.png,1e9', expected name,stamp or stamp,name"),
     ("folder", write("clouds/0.000000001.bin", bytes(3)), "3 bytes, expected a multiple of 16"),
     ("nuscenes", write("v1.0-mini/sample.json", "[{"), "no whole record after 0"),
     ("nuscenes", write("v1.0-mini/scene.json", "{}"), "expected a table of nuScenes"),
@@ -237,6 +237,31 @@ def test_cameras_of_other_tools(folder: Path, kind: str) -> None:
             open_source(folder)
 
 
+def test_a_camera_is_found_in_a_chain_by_its_name_or_topic(tmp_path: Path) -> None:
+    file = tmp_path / "camera.yaml"
+    one = "{{intrinsics: [{}, 30, 16, 12], resolution: [32, 24], rostopic: {}}}\n"
+    file.write_text(
+        "cam0: " + one.format(30, "/left/image_raw") + "cam1: " + one.format(31, "/right/image_raw")
+    )
+    for name, fx in {
+        "": 30.0,
+        "cam1": 31.0,
+        "/right/image_raw": 31.0,
+        "/right/image_raw/compressed": 31.0,
+        "/right/image_mono": 31.0,
+        "left": 30.0,
+    }.items():
+        assert read_camera(file, name).intrinsics.fx == fx, name
+    with pytest.raises(DataError, match=r"cameras cam0 \(/left/image_raw\), .*, expected one of .* front"):
+        read_camera(file, "front")
+    unnamed = "{intrinsics: [30, 30, 16, 12], resolution: [32, 24]}\n"
+    file.write_text("cam1: " + one.format(31, "/right/image_raw") + "cam2: " + unnamed)
+    with pytest.raises(DataError, match="expected one of the name or rostopic cam0"):
+        read_camera(file)
+    file.write_text("cam1: " + one.format(31, "/right/image_raw"))
+    assert read_camera(file).intrinsics.fx == read_camera(file, "front").intrinsics.fx == 31.0
+
+
 def test_an_extrinsic_as_translation_and_quaternion(folder: Path) -> None:
     (folder / "extrinsic.yaml").write_text("translation: [1, 2, 3]\nquaternion: [0.5, -0.5, 0.5, -0.5]\n")
     nominal = open_source(folder).nominal
@@ -254,6 +279,31 @@ def test_stamps_in_a_table_and_files_that_are_not_in_it(folder: Path) -> None:
     (folder / "images.csv").write_text("\n".join(["name,stamp_ns", *lines]) + "\n")
     stamps = [frame.image.stamp_ns for frame in open_source(folder) if frame.image is not None]
     assert stamps == [7_000_000, 57_000_000, 107_000_000]
+
+
+@pytest.mark.parametrize(
+    ("heading", "line"),
+    [
+        ("#timestamp [ns],filename", "{ns},{name}"),  # EuRoC
+        ("filename,timestamp", "{name},{seconds}"),
+        ("", "{seconds},{name}"),
+        ("", "{name},{ns}"),
+    ],
+)
+def test_columns_in_either_order_and_stamps_in_either_unit(tmp_path: Path, heading: str, line: str) -> None:
+    """Names that are themselves numbers are told from stamps by the files that are there."""
+    images = tmp_path / "images"
+    images.mkdir()
+    stamps = [1_700_000_000_000_000_000 + 100_000_000 * k for k in range(3)]
+    lines = [heading] if heading else []
+    for k, stamp in enumerate(stamps):
+        name, seconds = f"{k:06d}.png", f"{stamp // 10**9}.{stamp % 10**9:09d}"
+        (images / name).write_bytes(b"")
+        lines.append(line.format(ns=stamp, name=name, seconds=seconds))
+    (tmp_path / "images.csv").write_text("\n".join(lines) + "\n")
+    files = stamped_files(images, (".png",))
+    assert files.stamps_ns.tolist() == stamps
+    assert [path.name for path in files.paths] == ["000000.png", "000001.png", "000002.png"]
 
 
 def test_a_table_with_quotes(tmp_path: Path) -> None:
@@ -276,7 +326,7 @@ def test_a_table_with_quotes(tmp_path: Path) -> None:
     assert [path.name for path in found.paths] == names
     assert found.stamps_ns.tolist() == [1_000_000_000, 2_000_000_000, 3_000_000_000]
     table.write_text('"3.png,1000000000\n')
-    with pytest.raises(DataError, match=r"images.csv:1: found .*, expected name,stamp_ns"):
+    with pytest.raises(DataError, match=r"images.csv:1: found .*, expected name,stamp or stamp,name"):
         stamped_files(images, (".png",))
     table.write_text(f"3.png,{2**63 - 1}\n")
     with pytest.raises(DataError, match=f"expected nanoseconds, at most {2**62}"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+from dataclasses import asdict
 from pathlib import Path
 
 import gtsam
@@ -17,7 +18,7 @@ from sst_graph import CalibrationConfig, calibrate
 from sst_graph.cameras import BrownConradyCamera, Rectification
 from sst_graph.cli import main
 from sst_graph.data import open_source
-from sst_graph.data.info import drive_info
+from sst_graph.data.info import drive_info, info_text
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.errors import DataError
 from sst_graph.types import Frame, Source
@@ -56,6 +57,21 @@ def test_a_folder_brings_the_frames_of_kitti_odometry(kitti_drive: Path, tmp_pat
     assert_same_drive(source, open_source(kitti_drive))
 
 
+def test_every_layout_says_where_its_start_comes_from(kitti_drive: Path, tmp_path: Path) -> None:
+    folder = as_folder(kitti_drive, tmp_path / "street")
+    for drive, reason in {
+        kitti_drive: "by calib.txt",
+        as_kitti_raw(kitti_drive, tmp_path / "raw"): "by calib_velo_to_cam.txt and calib_cam_to_cam.txt",
+        as_nuscenes(kitti_drive, tmp_path / "nuscenes"): "by calibrated_sensor.json",
+        folder: "by extrinsic.yaml",
+    }.items():
+        sequence = "61" if reason == "by calibrated_sensor.json" else None
+        assert drive_info(open_source(drive, sequence=sequence)).nominal_reason == reason
+    (folder / "extrinsic.yaml").unlink()
+    info = drive_info(open_source(folder))
+    assert not info.nominal and info.nominal_reason == "no extrinsic.yaml"
+
+
 def test_files_that_macos_leaves_are_no_frames(kitti_drive: Path, tmp_path: Path) -> None:
     folder = as_folder(kitti_drive, tmp_path / "folder")
     count = len(open_source(folder))
@@ -78,6 +94,16 @@ def test_a_folder_of_a_lens_that_distorts_is_rectified(tmp_path: Path) -> None:
     for found, raw in zip(drive[1:3], plain[1:3], strict=True):  # type: ignore[misc]
         assert found.image == rectification.image(raw.image) and found.scan == raw.scan
         assert found.image.mask.shape == (drive.camera.height, drive.camera.width)
+    info = drive_info(drive)
+    lens = {
+        "model": "plumb_bob",
+        **asdict(plain.camera),
+        "distortion": {"coefficients": (-0.1, 0.0, 0.0, 0.0)},
+    }
+    assert info.camera["lens"] == lens and info.image_sensor == drive_info(plain).image_sensor
+    lines = info_text(info).splitlines()
+    assert lines[2].strip().startswith("rectified from plumb_bob") and lines[2].endswith("-0.1 0 0 0")
+    assert "lens" not in drive_info(plain).camera
 
 
 @pytest.mark.slow
@@ -99,7 +125,10 @@ def test_motion_needs_neither_labels_nor_tr(tmp_path: Path, capsys: pytest.Captu
     assert np.abs(step).max() < 1e-12 and results[0].time_offset_s == results[1].time_offset_s
     assert results[1].frames_used
     assert main(["calibrate", str(bare), "--method", "motion", "--out", str(tmp_path / "out")]) == 2
-    assert "brings no nominal calibration: give --init none" in capsys.readouterr().err
+    assert (
+        "brings no nominal calibration (calib.txt has no line Tr): give --init none"
+        in capsys.readouterr().err
+    )
 
 
 @pytest.mark.slow

@@ -87,8 +87,20 @@ def test_numpy_files(tmp_path: Path) -> None:
     points = np.stack([values[name] for name in "xyz"], axis=1)
     np.save(tmp_path / "b.npy", np.asfortranarray(points, np.float64))
     np.testing.assert_array_equal(read_cloud(tmp_path / "b.npy").points(), points)
-    np.savez(tmp_path / "b.npz", points=points, ring=values["ring"])
-    np.testing.assert_array_equal(read_cloud(tmp_path / "b.npz").rings(), values["ring"])
+    for name in ("points", "xyz", "arr_0"):
+        np.savez(tmp_path / "b.npz", **{name: points}, ring=values["ring"])
+        np.testing.assert_array_equal(read_cloud(tmp_path / "b.npz").rings(), values["ring"])
+        np.testing.assert_array_equal(read_cloud(tmp_path / "b.npz").points(), points[:, :3])
+    xyz = {axis: values[axis] for axis in "xyz"}
+    np.savez(tmp_path / "b.npz", **xyz, normals=np.ones((len(points), 3)))
+    np.testing.assert_array_equal(read_cloud(tmp_path / "b.npz").points(), points[:, :3])
+
+
+def test_fields_as_cloudcompare_names_them(tmp_path: Path) -> None:
+    values = records()
+    names = {name: name if name in "xyz" else f"scalar_{name.capitalize()}" for name in DTYPE.names or ()}
+    np.save(tmp_path / "a.npy", values.view([(names[name], DTYPE[name]) for name in DTYPE.names or ()]))
+    assert_read(tmp_path / "a.npy", values)
 
 
 def test_a_cloud_without_points(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from sst_graph import calibrate
 from sst_graph.cli.pictures import ShownFrame, telling_positions
 from sst_graph.data import SourceOptions, open_source
 from sst_graph.data.frame_parts import RecentReader
+from sst_graph.data.info import drive_info
 from sst_graph.data.two_clocks import DriveProperties, Sensor, TwoClockSource, merged
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.factors import PinholeCamera
@@ -107,6 +108,10 @@ def test_kitti_odometry_with_image_stamps_of_its_own(kitti_drive: Path) -> None:
     third = source[3]
     assert third.scan is not None and third.image is not None
     assert (third.image.pixels == 20).all()
+    info = drive_info(source)
+    assert info.scan_sensor.place == str(kitti_drive / "velodyne")
+    assert (info.image_sensor.place, info.image_sensor.count) == (str(kitti_drive / "image_2"), 5)
+    assert info.nominal_reason == "by calib.txt" and "label without a scan" in info.notes[0]
     plain = open_source(kitti_drive, frames="3:4")
     assert plain[0].image is not None
     (kitti_drive / "times_2.txt").write_text("0.1\n0.2\n")

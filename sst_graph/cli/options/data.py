@@ -18,6 +18,7 @@ SOURCE_DEFAULTS: dict[str, str | int | float | None] = {
     "image_topic": None,
     "cloud_topic": None,
     "info_topic": None,
+    "camera_file": None,
     "mask_topic": None,
     "stamps": "header",
     "label_encoding": "auto",
@@ -91,6 +92,12 @@ def add_source_options(command: argparse.ArgumentParser, several_cameras: bool =
     bag.add_argument("--cloud-topic", metavar="TOPIC", help="PointCloud2, where there are several")
     bag.add_argument(
         "--info-topic", metavar="TOPIC", help="CameraInfo (default: camera_info beside the images)"
+    )
+    bag.add_argument(
+        "--camera-file",
+        metavar="FILE",
+        help="the camera, in the place of CameraInfo: a camera.yaml as of a folder, Kalibr's camchain, or "
+        "OpenCV's or ROS's calibration",
     )
     bag.add_argument(
         "--mask-topic",

@@ -12,6 +12,7 @@ An extrinsic is ``T_camera_lidar`` (4x4), or ``translation`` [m] and ``quaternio
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -26,13 +27,18 @@ from sst_graph.files.checked_values import checked_pose, pinhole_camera
 from sst_graph.files.yaml_file import number, numbers, read_yaml
 
 _EXPECTED = "fx, fy, cx, cy, width, height; or Kalibr's cam0; or OpenCV's camera_matrix"
+_IN_CHAIN = re.compile(r"cam\d+", re.ASCII)
 _PLAIN = ("fx", "fy", "cx", "cy", "width", "height", "distortion_model", "distortion")
 _ROUNDED = 1e-3
 """A quaternion's length differs from 1 by no more than its digits were rounded."""
 
 
-def read_camera(path: Path) -> CameraModel:
+def read_camera(path: Path, name: str = "") -> CameraModel:
     """Intrinsics and distortion of a camera.
+
+    Args:
+        name: of the camera, or the topic of its images, by which it is found in a chain of several; without
+            it cam0.
 
     Raises:
         DataError: a file that holds none, an unknown distortion, intrinsics that are none.
@@ -42,19 +48,42 @@ def read_camera(path: Path) -> CameraModel:
     if "fx" in table:
         if unknown := [key for key in table if key not in _PLAIN]:
             raise DataError(path, f"the key {unknown[0]!r:.60}", f"none but {', '.join(_PLAIN)}")
-        names = _PLAIN[:6]
-        fx, fy, cx, cy, *size = (number(_entry(table, name, path), f"{path} ({name})") for name in names)
+        fx, fy, cx, cy, *size = (number(_entry(table, key, path), f"{path} ({key})") for key in _PLAIN[:6])
         width, height = (_whole(side, path) for side in size)
         intrinsics = pinhole_camera((fx, fy, cx, cy), (width, height), path)
         coefficients = numbers(table.get("distortion") or [], f"{path} (distortion)")
         return camera_of(intrinsics, str(table.get("distortion_model", "none")), coefficients, path)
-    if isinstance(table.get("cam0"), dict):
-        return cameras_from_kalibr({"cam0": {"camera_model": "pinhole", **table["cam0"]}}, path)["cam0"].model
+    chain = {str(key): value for key, value in table.items() if _IN_CHAIN.fullmatch(str(key))}
+    if any(isinstance(value, dict) for value in chain.values()):
+        key = _of_chain(chain, name, path)
+        return cameras_from_kalibr({key: {"camera_model": "pinhole", **chain[key]}}, path)[key].model
     if "camera_matrix" in table or "K" in table:
         if "D" not in table:
             table.setdefault("distortion_coefficients", [])
         return camera_from_opencv(table, path)
     raise DataError(path, f"keys {', '.join(map(str, table))}"[:200], _EXPECTED)
+
+
+def _of_chain(chain: Mapping[str, Any], name: str, path: Path) -> str:
+    """The camera of a chain: the only one, or that of a name, a topic or its namespace."""
+    topics = {key: str(table.get("rostopic", "")) for key, table in chain.items() if isinstance(table, dict)}
+    if len(topics) == 1 or (not name and "cam0" in topics):
+        return min(topics)
+    topic = name.removesuffix("/compressed")
+    for same in filter(None, (topic, topic.rpartition("/")[0])):
+        found = [key for key, own in topics.items() if same.strip("/") in (key, _plain(own), _space(own))]
+        if len(found) == 1:
+            return found[0]
+    listed = ", ".join(f"{key} ({own})" if own else key for key, own in topics.items())
+    raise DataError(path, f"cameras {listed}", f"one of the name or rostopic {name or 'cam0'}")
+
+
+def _plain(topic: str) -> str:
+    return topic.removesuffix("/compressed").strip("/")
+
+
+def _space(topic: str) -> str:
+    return _plain(topic).rpartition("/")[0]
 
 
 def read_extrinsic(path: Path) -> gtsam.Pose3:

@@ -33,7 +33,7 @@ from sst_graph.types import CameraImage, Scan, Source, with_intensities
 
 _LOG = logging.getLogger(__name__)
 
-LAYOUT = "a folder with images, clouds and camera.yaml; stamps as names or in images.csv and clouds.csv"
+LAYOUT = "a folder with images, clouds, camera.yaml; stamps as names or in images.csv, clouds.csv"
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 _IMAGES, _CLOUDS, _CAMERA, _EXTRINSIC = "images", "clouds", "camera.yaml", "extrinsic.yaml"
 _DEFAULT_CAMERA, _DEFAULT_CLOUD = SourceOptions().camera, SourceOptions().cloud
@@ -119,7 +119,7 @@ def open_folder(path: Path, options: SourceOptions) -> Source:
         if files.without_stamp:
             found = count_of(files.without_stamp, what.removesuffix("s"))
             _LOG.warning("%s: %s without a stamp left out", printable(path), found)
-    model = read_camera(own / _CAMERA)
+    model = read_camera(own / _CAMERA, "" if own == path else options.camera)
     extrinsic = own / _EXTRINSIC
     nominal = read_extrinsic(extrinsic) if os.path.lexists(extrinsic) else None
     size = (model.width, model.height)
@@ -136,7 +136,9 @@ def open_folder(path: Path, options: SourceOptions) -> Source:
     def image(k: int) -> CameraImage:
         return pictures.image(k, int(images.stamps_ns[k]))
 
-    properties = DriveProperties(printable(path.resolve().name), model.intrinsics, nominal)
+    reason = f"by {_EXTRINSIC}" if nominal is not None else f"no {_EXTRINSIC}"
+    name = printable(path.resolve().name)
+    properties = DriveProperties(name, model.intrinsics, nominal, nominal_reason=reason)
     of_scans = Sensor(clouds.stamps_ns, scans.scan, _CLOUDS)
     of_images = Sensor(images.stamps_ns, image, _IMAGES)
     drive = merged(properties, of_scans, of_images, options, path)

@@ -1,8 +1,8 @@
 """Stamps of files: in a CSV file beside them, or as their names.
 
-``images.csv`` beside ``images/``: one "name,stamp_ns" a line, quotes or none; a first line of words is a
-heading; a file without a line is left out. As a name: seconds with a decimal point ("1317048145.963.png"), or
-whole nanoseconds ("1317048145963000000.png").
+``images.csv`` beside ``images/``: one "name,stamp" a line, or "stamp,name" (EuRoC), quotes or none; a first
+line of words is a heading; a file without a line is left out. A stamp, here or as a name, is seconds with a
+decimal point ("1317048145.963.png"), or whole nanoseconds ("1317048145963000000.png").
 """
 
 from __future__ import annotations
@@ -21,12 +21,15 @@ from sst_graph.errors import DataError, count_of
 from sst_graph.files.reading import FileKind, read_text
 from sst_graph.timestamps import MAX_STAMPS, check_rising, checked_ns, parse_seconds
 
-STAMPS_CSV = FileKind("a CSV file of name,stamp_ns", 128 * 1024 * 1024)
+STAMPS_CSV = FileKind("a CSV file of name,stamp", 128 * 1024 * 1024)
 LEAST_STEP_NS = 1_000_000
 """Median interval [ns] below which whole numbers are no nanoseconds but a count, or another unit."""
 
 _WHOLE = re.compile(r"[+-]?\d{1,20}", re.ASCII)
+_NUMBER = re.compile(r"[+-]?\d", re.ASCII)
 _SECONDS = re.compile(r"\d{1,12}\.\d+", re.ASCII)
+_STAMP = "seconds with a decimal point, or whole nanoseconds"
+_LINE = f"name,stamp or stamp,name; the stamp in {_STAMP}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,12 +82,17 @@ def stamped_files(folder: Path, suffixes: tuple[str, ...]) -> StampedFiles:
 def _stamp_of(path: Path, table: Path) -> int:
     """Stamp [ns] that a file's name is."""
     stem = path.name[: -len(path.suffix)]
-    if _SECONDS.fullmatch(stem):
-        return parse_seconds(stem, path)
-    if _WHOLE.fullmatch(stem):
-        return checked_ns(int(stem), path)
-    expected = f"a stamp (seconds with a decimal point, or whole nanoseconds), or {table.name} beside it"
+    if (stamp := _stamp(stem, path)) is not None:
+        return stamp
+    expected = f"a stamp ({_STAMP}), or {table.name} beside it"
     raise DataError(path, f"the name {stem!r:.80}", expected)
+
+
+def _stamp(word: str, place: str | Path) -> int | None:
+    """A stamp [ns], or None where the word is none."""
+    if _SECONDS.fullmatch(word):
+        return parse_seconds(word, place)
+    return checked_ns(int(word), place) if _WHOLE.fullmatch(word) else None
 
 
 def _table(table: Path, files: Mapping[str, Path]) -> dict[str, int]:
@@ -95,19 +103,28 @@ def _table(table: Path, files: Mapping[str, Path]) -> dict[str, int]:
     stamps: dict[str, int] = {}
     for number, line in enumerate(text.splitlines(), 1):
         words = _words(line)
-        if not any(words) or (number == 1 and len(words) == 2 and words[1][:1].isalpha()):
+        place = f"{table}:{number}"
+        if not any(words) or (number == 1 and _is_heading(words, files)):
             continue
-        if len(words) != 2 or not _WHOLE.fullmatch(words[1]):
-            raise DataError(f"{table}:{number}", f"{line!r:.80}", "name,stamp_ns")
-        name = words[0]
+        if len(words) != 2:
+            raise DataError(place, f"{line!r:.80}", _LINE)
+        # A file may be called by a number, too: 000000 or its stamp.
+        name, word = words if words[0] in files or words[1] not in files else reversed(words)
+        if (stamp := _stamp(word, place)) is None:
+            raise DataError(place, f"{line!r:.80}", _LINE)
         if name not in files:
-            raise DataError(f"{table}:{number}", f"{name!r:.80}", f"the name of a file in {table.stem}")
+            raise DataError(place, f"{name!r:.80}", f"the name of a file in {table.stem}")
         if name in stamps:
-            raise DataError(f"{table}:{number}", f"{name!r:.80} again", "each file once")
-        stamps[name] = checked_ns(int(words[1]), f"{table}:{number}")
+            raise DataError(place, f"{name!r:.80} again", "each file once")
+        stamps[name] = stamp
     if not stamps:
-        raise DataError(table, "no stamp", "one name,stamp_ns a line")
+        raise DataError(table, "no stamp", "one name,stamp a line")
     return stamps
+
+
+def _is_heading(words: list[str], files: Mapping[str, Path]) -> bool:
+    """Whether a line names neither a file nor a number: "name,stamp_ns", "#timestamp [ns],filename"."""
+    return len(words) == 2 and not any(word in files or _NUMBER.match(word) for word in words)
 
 
 def _words(line: str) -> list[str]:

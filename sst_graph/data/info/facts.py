@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+
+from sst_graph.types import Source
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,10 +41,9 @@ class SourceFacts:
     notes: tuple[str, ...] = ()
 
 
-@runtime_checkable
-class FactsReader(Protocol):
-    """A source that tells what it holds; of others a few frames are looked at."""
-
-    def facts(self) -> SourceFacts:
-        """Sensors and their stamps; no frame is read."""
-        ...
+def facts_of(source: Source) -> SourceFacts | None:
+    """Sensors and their stamps, where a source, or the one that it is a view of, has a method ``facts``; no
+    frame is read. Of other sources a few frames are looked at.
+    """
+    reader = getattr(source, "facts", None)
+    return reader() if callable(reader) else None

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.cameras import Rectification
 from sst_graph.data.frame_parts import image_at, image_positions, scan_at, scan_positions
 from sst_graph.data.images import DARK
-from sst_graph.data.info.facts import FactsReader, SensorFacts, SourceFacts
+from sst_graph.data.info.facts import SensorFacts, SourceFacts, facts_of
 from sst_graph.data.info.methods import Content, missing_for
 from sst_graph.sampling import evenly_spread
 from sst_graph.timestamps import FAR_APART_S, apart_s
@@ -100,7 +101,8 @@ class DriveInfo:
     Attributes:
         name: of the drive.
         frames: number of frames.
-        camera: model, intrinsics [px] and size [px].
+        camera: model, intrinsics [px] and size [px]; of pictures that are rectified as they are read also the
+            ``lens``, with its own.
         scan_sensor, image_sensor: numbers, rates, stamps.
         scans, images: what those looked at hold; None where there was none.
         nominal: whether the data bring a nominal extrinsic; ``nominal_reason``: where from, or why not.
@@ -131,7 +133,7 @@ def drive_info(source: Source) -> DriveInfo:
     scans = [scan for k in places if (scan := scan_at(source, k)) is not None]
     places = evenly_spread(image_positions(source), SAMPLED)
     images = [image for k in places if (image := image_at(source, k)) is not None]
-    facts = source.facts() if isinstance(source, FactsReader) else None
+    facts = facts_of(source)
     scan_sensor = _sensor(facts.scan if facts else None, scans, len(source))
     image_sensor = _sensor(facts.image if facts else None, images, len(source))
     facts = facts or SourceFacts(
@@ -151,7 +153,7 @@ def drive_info(source: Source) -> DriveInfo:
     return DriveInfo(
         name=source.name,
         frames=len(source),
-        camera={"model": "pinhole", **asdict(source.camera)},
+        camera=_camera(source),
         scan_sensor=scan_sensor,
         image_sensor=image_sensor,
         scans=of_scans,
@@ -161,6 +163,16 @@ def drive_info(source: Source) -> DriveInfo:
         notes=facts.notes,
         missing=missing_for(content),
     )
+
+
+def _camera(source: Source) -> dict[str, Any]:
+    table = {"model": "pinhole", **asdict(source.camera)}
+    # A view of a drive passes on what else that has to say.
+    rectification = getattr(source, "rectification", None)
+    if isinstance(rectification, Rectification):
+        lens = asdict(rectification.model)
+        table["lens"] = {"model": rectification.model.name, **lens.pop("intrinsics"), "distortion": lens}
+    return table
 
 
 def _black(images: Sequence[CameraImage]) -> bool:

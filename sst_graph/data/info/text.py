@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
 
 from sst_graph.data.info.summary import DriveInfo, ImageInfo, ScanInfo, SensorInfo
 from sst_graph.errors import count_of
@@ -21,14 +24,10 @@ def info_text(info: DriveInfo) -> str:
 
 def _lines(info: DriveInfo) -> Iterator[tuple[str, str]]:
     yield "drive", f"{info.name}: {count_of(info.frames, 'frame')}"
-    c = info.camera
-    yield (
-        "camera",
-        (
-            f"{c['model']}, {c['width']}x{c['height']} px, fx {c['fx']:.2f}, fy {c['fy']:.2f}, "
-            f"cx {c['cx']:.2f}, cy {c['cy']:.2f} px"
-        ),
-    )
+    yield "camera", _camera(info.camera)
+    if "lens" in info.camera:
+        lens = info.camera["lens"]
+        yield "", f"rectified from {_camera(lens)}, {_distortion(lens['distortion'])}"
     for name, sensor in (("images", info.image_sensor), ("scans", info.scan_sensor)):
         yield name, _sensor(sensor)
         for gap in sorted(sensor.gaps, key=lambda one: -one.seconds)[:_GAPS]:
@@ -44,6 +43,17 @@ def _lines(info: DriveInfo) -> Iterator[tuple[str, str]]:
         yield "note", note
     for method, missing in info.missing.items():
         yield method, f"missing: {', '.join(missing)}" if missing else "nothing is missing"
+
+
+def _camera(table: Mapping[str, Any]) -> str:
+    size = f"{table['width']}x{table['height']} px"
+    numbers = ", ".join(f"{name} {table[name]:.2f}" for name in ("fx", "fy", "cx", "cy"))
+    return f"{table['model']}, {size}, {numbers} px"
+
+
+def _distortion(values: Mapping[str, Any]) -> str:
+    """Numbers of a lens: "coefficients -0.37 0.2 0.001"."""
+    return ", ".join(f"{name} {' '.join(f'{v:.6g}' for v in np.ravel(values[name]))}" for name in values)
 
 
 def _sensor(sensor: SensorInfo) -> str:

@@ -105,7 +105,7 @@ class KittiSource(IndexedSource):
         return SourceFacts(
             scan=SensorFacts(_folder(self.files.scans), self.stamps_ns[with_scan]),
             image=SensorFacts(_folder(images), self.stamps_ns[with_image]),
-            nominal="calib.txt has no line Tr" if self.nominal is None else "by calib.txt",
+            nominal=self.properties.nominal_reason,
             notes=(
                 "scans and images have the same stamps, those of times.txt",
                 *([missing] if missing else []),
@@ -178,7 +178,8 @@ def open_kitti(path: Path, options: SourceOptions) -> KittiSource | TwoClockSour
     truth, is_reference = drive_truth(folder, calibration, options.camera)
     camera = calibration.camera(options.camera, *size)
     sweep = options.sweep, options.sweep_stamp
-    properties = DriveProperties(_name(folder), camera, nominal, truth, is_reference, *sweep)
+    reason = "calib.txt has no line Tr" if nominal is None else "by calib.txt"
+    properties = DriveProperties(_name(folder), camera, nominal, truth, is_reference, *sweep, reason)
     encoding = mask_encoding(files.masks, options.label_encoding, size)
     pictures = PictureFiles(size, files.images, files.masks, encoding)
     if image_stamps_ns is not None:
@@ -205,8 +206,11 @@ def _with_image_stamps(
     def image(k: int) -> CameraImage:
         return pictures.image(int(images[k]), int(image_stamps_ns[images[k]]))
 
-    of_scans, of_images = Sensor(source.stamps_ns[scans], scan), Sensor(image_stamps_ns[images], image)
-    return merged(source.properties, of_scans, of_images, options, folder)
+    files, missing = source.files, source.files.missing()
+    of_scans = Sensor(source.stamps_ns[scans], scan, _folder(files.scans))
+    of_images = Sensor(image_stamps_ns[images], image, _folder(files.images or files.masks))
+    properties = replace(source.properties, notes=(missing,) if missing else ())
+    return merged(properties, of_scans, of_images, options, folder)
 
 
 def _select(files: KittiFiles, options: SourceOptions, count: int) -> tuple[int, ...]:

@@ -12,10 +12,7 @@ from pathlib import Path
 from sst_graph.data.arrays import check_stamped, listed, numbered_files, optional_files
 from sst_graph.errors import ConfigError, DataError, count_of
 
-LAYOUT = (
-    "KITTI odometry: PATH/sequences/NN with calib.txt, times.txt, velodyne, image_2; labels, "
-    "semantic_2 where there are any"
-)
+LAYOUT = "KITTI odometry: PATH/sequences/NN with calib.txt, times.txt, velodyne, image_2"
 
 _PICTURES = (".png", ".jpg", ".jpeg")
 

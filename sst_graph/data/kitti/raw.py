@@ -24,7 +24,13 @@ from numpy.typing import NDArray
 from sst_graph.cameras import CameraModel, Rectification
 from sst_graph.data.arrays import MAX_POINTS, check_metres, read_points
 from sst_graph.data.images import picture_size
-from sst_graph.data.kitti.raw_calib import RawCalibration, raw_camera_number, read_raw_calibration
+from sst_graph.data.kitti.raw_calib import (
+    CAM_TO_CAM,
+    VELO_TO_CAM,
+    RawCalibration,
+    raw_camera_number,
+    read_raw_calibration,
+)
 from sst_graph.data.kitti.raw_layout import (
     LAYOUT,
     SweepTimes,
@@ -154,7 +160,8 @@ def open_raw(path: Path, options: SourceOptions) -> Source:
 
     is_reference = not (drive / "groundtruth.json").exists()
     name = printable(drive.resolve().name)
-    properties = DriveProperties(name, model.intrinsics, nominal, truth, is_reference)
+    reason = f"by {VELO_TO_CAM} and {CAM_TO_CAM}"
+    properties = DriveProperties(name, model.intrinsics, nominal, truth, is_reference, nominal_reason=reason)
     of_scans = Sensor(scan_stamps, scan, "velodyne_points")
     of_images = Sensor(image_stamps, image, f"image_{number:02d}")
     source = merged(properties, of_scans, of_images, options, drive)

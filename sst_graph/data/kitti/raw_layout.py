@@ -13,15 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.data.arrays import check_stamped, listed, numbered_files, optional_files
-from sst_graph.data.kitti.raw_calib import CAM_TO_CAM, VELO_TO_CAM
+from sst_graph.data.kitti.raw_calib import CAM_TO_CAM
 from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.files.reading import FileKind, read_text
 from sst_graph.timestamps import MAX_STAMPS, NS_PER_S, check_rising, checked_ns
 
-LAYOUT = (
-    "KITTI raw: DATE/DATE_drive_NNNN_sync (or _extract) with velodyne_points and image_0N, and"
-    f" {CAM_TO_CAM} and {VELO_TO_CAM} in DATE"
-)
+LAYOUT = f"KITTI raw: DATE with {CAM_TO_CAM} and DATE_drive_NNNN_sync with velodyne_points, image_0N"
 TIMESTAMPS = FileKind("timestamps of KITTI raw, one a line", 64 * 1024 * 1024)
 
 _CLOUD = "velodyne_points"

@@ -35,7 +35,7 @@ from sst_graph.types import CameraImage, GroundTruth, Scan, SemanticClass, Sourc
 
 _LOG = logging.getLogger(__name__)
 
-LAYOUT = "nuScenes: PATH with v1.0-* (tables), samples and sweeps"
+LAYOUT = "nuScenes: PATH with v1.0-*, samples, sweeps"
 _LIDAR, _CAMERA = "LIDAR_TOP", "CAM_FRONT"
 _NS_PER_US = 1000
 _PCD_BIN = FileKind("a nuScenes cloud of x y z intensity ring in float32", 20 * MAX_POINTS)
@@ -147,7 +147,13 @@ def open_nuscenes(path: Path, options: SourceOptions) -> Source:
     name = f"nuscenes/{printable(text_of(scene, 'name', tables))}"
     notes = tuple(_left_out(before, after) for before, after in zip(stored, (lidar, camera), strict=True))
     properties = DriveProperties(
-        name, model.intrinsics, nominal, GroundTruth(nominal, None), True, notes=tuple(filter(None, notes))
+        name,
+        model.intrinsics,
+        nominal,
+        GroundTruth(nominal, None),
+        True,
+        nominal_reason="by calibrated_sensor.json",
+        notes=tuple(filter(None, notes)),
     )
     for note in properties.notes:
         _LOG.warning("%s: %s", printable(path), note)

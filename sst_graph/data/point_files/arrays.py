@@ -1,8 +1,8 @@
 """Clouds in files of plain arrays: KITTI's .bin, NumPy's .npy and .npz.
 
 A .npy is a structured array with fields x, y, z, ..., or an array (n, 3) or (n, 4) of x y z and intensity.
-A .npz has one array a field, or such an array named ``points`` beside fields of their own. Nothing is
-unpickled.
+A .npz has one array a field, or such an array, the only one of two dimensions or named ``points``, beside
+fields of their own. Nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -80,8 +80,11 @@ def read_npz(data: bytes, path: Path) -> Cloud:
                 arrays[member.filename.removesuffix(".npy")] = _array(content, path)
     except (*_BROKEN, RuntimeError) as error:
         raise DataError(path, f"no .npz file ({first_line(error)})", "arrays that NumPy wrote") from None
+    tables = [name for name, array in arrays.items() if array.ndim == 2]
+    alone = len(tables) == 1 and "x" not in {name.lower() for name in arrays}
     for name, array in arrays.items():
-        fields.update(_fields(array, path) if name == "points" else {name: array})
+        is_table = name == "points" or (alone and name in tables)
+        fields.update(_fields(array, path) if is_table else {name: array})
     return cloud_of(path, fields)
 
 

@@ -22,7 +22,9 @@ MAX_POINT_BYTES = 1024
 """Of one point with all its fields."""
 
 RINGS = ("ring", "rings", "channel", "laser_id")
-TIMES = ("time", "times", "t", "timestamp", "time_stamp", "offset_time")
+"""Fields, in lower case, with the number of the laser."""
+TIMES = ("time", "times", "t", "timestamp", "time_stamp", "offset_time", "time_offset", "time_offset_ns")
+"""Fields with the time of a point: of Velodyne, Ouster, Hesai and RoboSense, Livox, Aeva."""
 LABELS = ("label", "labels")
 INTENSITIES = ("intensity", "reflectivity", "reflectance", "remission", "i")
 
@@ -120,7 +122,8 @@ def cloud_of(path: Path, fields: Mapping[str, NDArray[Any]]) -> Cloud:
     Raises:
         DataError: no x, y, z, a field of other than numbers, or fields of other lengths.
     """
-    lower = {name.lower(): values for name, values in fields.items()}
+    # CloudCompare puts "scalar_" before all but coordinates and colours.
+    lower = {name.lower().removeprefix("scalar_"): values for name, values in fields.items()}
     missing = [name for name in "xyz" if name not in lower]
     if missing:
         named = ", ".join(sorted(fields)) or "none"

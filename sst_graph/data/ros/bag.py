@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.data.ros.livox import CUSTOM, OLDER_CUSTOM, custom_points
 from sst_graph.errors import DataError, SstGraphError, count_of, one_line, optional_module
 
 WHOLE_BAG = (
@@ -22,9 +23,10 @@ WHOLE_BAG = (
 )
 
 TF_MESSAGE = "tf2_msgs/msg/TFMessage"
-_OLD_TF_MESSAGE = "tf/msg/tfMessage"
-"""The same message under the name that it has in bags of the first versions of ROS 1."""
+_SAME = {"tf/msg/tfMessage": TF_MESSAGE, **dict.fromkeys(OLDER_CUSTOM, CUSTOM)}
+"""Names that messages have in older bags; those of transforms in bags of the first versions of ROS 1."""
 
+_LONGEST_PROFILE = 256
 _KEPT = 8
 """Messages that are kept of those read last: image, mask and scan of one instant stand side by side."""
 _SKIPPED_AT_MOST = 16
@@ -93,6 +95,9 @@ class Bag:
                     raise ValueError(f"topic {one.topic!r:.40} of type {one.msgtype!r:.40}")
         except Exception as error:
             stack.close()
+            profile = _profile(self.path)
+            if profile not in ("", "ros2"):
+                raise DataError(self.path, f"MCAP of profile {profile!r:.40}", "profile 'ros2'") from error
             raise _unreadable(self.path, error) from error
         weakref.finalize(self, stack.close)
         self._types = message_types(self.is_ros1)
@@ -107,7 +112,7 @@ class Bag:
     def topics(self) -> dict[str, Topic]:
         """Topics by name."""
         return {
-            name: Topic(name, of_topic[0].msgtype, sum(one.msgcount for one in of_topic))
+            name: Topic(name, _type_of(of_topic[0]), sum(one.msgcount for one in of_topic))
             for name, of_topic in sorted(self._connections.items())
         }
 
@@ -214,18 +219,26 @@ class Bag:
         return seconds, nanoseconds, length
 
     def decoded(self, data: bytes, type_name: str) -> Any:
-        """A message with its fields as attributes.
+        """A message with its fields as attributes; of Livox's CustomMsg the points, by field.
 
         Raises:
             DataError: the bytes hold no message of this type.
         """
-        type_name = TF_MESSAGE if type_name == _OLD_TF_MESSAGE else type_name
+        if type_name == CUSTOM:
+            at = 16 + self._header(data)[2] + (not self.is_ros1)
+            return custom_points(data, at, self.is_ros1, f"{self.path}, {CUSTOM}")
         try:
             if self.is_ros1:
                 return self._types.deserialize_ros1(data, type_name)
             return self._types.deserialize_cdr(data, type_name)
         except Exception as error:
             raise _unreadable(self.path, error) from error
+
+
+def _type_of(connection: Any) -> str:
+    """Type of a topic's messages, by the newest of its names."""
+    name = str(connection.msgtype)
+    return _SAME.get(name, name)
 
 
 def message_types(is_ros1: bool) -> Any:
@@ -236,6 +249,23 @@ def message_types(is_ros1: bool) -> Any:
     if TF_MESSAGE not in types.fielddefs:
         types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF_MESSAGE))
     return types
+
+
+def _profile(path: Path) -> str:
+    """Profile in the header of an MCAP file, which says whose messages it holds; empty where none does.
+
+    A header is the file's first record: magic (8 bytes), opcode 1, length of the record (8) and of the
+    profile's name (4).
+    """
+    try:
+        with open(path, "rb") as stream:
+            start = stream.read(_LONGEST_PROFILE)
+    except OSError:
+        return ""
+    if not start.startswith(b"\x89MCAP") or len(start) < 21:
+        return ""
+    (length,) = struct.unpack_from("<I", start, 17)
+    return start[21 : 21 + length].decode("utf-8", "replace")
 
 
 def _close(reader: Any) -> None:

@@ -1,9 +1,10 @@
-"""The camera of a drive's images by their sensor_msgs/CameraInfo."""
+"""The camera of a drive's images by their sensor_msgs/CameraInfo, or by a file."""
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import gtsam
@@ -11,6 +12,7 @@ import numpy as np
 
 from sst_graph.cameras import CameraModel
 from sst_graph.cameras.readers import camera_from_camera_info, check_full_sensor
+from sst_graph.data.folder.camera_file import read_camera
 from sst_graph.errors import DataError
 from sst_graph.files.checked_values import checked_pose
 
@@ -38,11 +40,36 @@ class ImageGeometry:
         return gtsam.Pose3(self.cRo, np.zeros(3)) * oTl
 
 
+def has_matrix(message: Any) -> bool:
+    """Whether a CameraInfo is of a calibrated camera: drivers without a calibration leave K at zero."""
+    return bool(np.any(getattr(message, "k", getattr(message, "K", ()))))
+
+
+def geometry_by_file(path: Path, image_topic: str, size: Size) -> ImageGeometry:
+    """Geometry of images of ``size`` by a file: the camera as the images are, rectified or not.
+
+    Raises:
+        DataError: a file that holds none, one of another size, or a lens of images that are rectified by the
+            name of their topic.
+        MissingDependencyError: PyYAML is not installed.
+    """
+    model = read_camera(path, image_topic)
+    if (model.width, model.height) != size:
+        raise DataError(
+            path, f"{model.width}x{model.height} px", "{}x{} px, the size of the images".format(*size)
+        )
+    if _RECTIFIED.search(image_topic) is not None and not model.is_pinhole:
+        found = f"a {model.name} lens for {image_topic}, whose name says that its images are rectified"
+        raise DataError(path, found, "their fx, fy, cx, cy (those of P) without distortion")
+    return ImageGeometry(model, gtsam.Rot3())
+
+
 def image_geometry(message: Any, image_topic: str, size: Size, place: str) -> ImageGeometry:
     """Geometry of images of ``size`` by their CameraInfo.
 
     Images of a topic with a word that begins with "rect" in its name, as image_proc writes them, have the
-    intrinsics of P and the rotation R; all others have those of K and the distortion D.
+    intrinsics of P and the rotation R; all others have those of K and the distortion D. Where P is left at
+    zero and nothing is distorted K holds for either.
 
     Raises:
         DataError: no calibration, one of another size, or an unknown distortion.
@@ -54,8 +81,8 @@ def image_geometry(message: Any, image_topic: str, size: Size, place: str) -> Im
         expected = f"{size[0]}x{size[1]} px, the size of the images"
         raise DataError(place, f"{calibrated[0]}x{calibrated[1]} px", expected)
     table |= {"width": size[0], "height": size[1]}
-    rectified = _RECTIFIED.search(image_topic) is not None
-    D = table["D"] if "D" in table else table["d"]
+    D, P = (table[name] if name in table else table[name.lower()] for name in "DP")
+    rectified = _RECTIFIED.search(image_topic) is not None and bool(np.any(P) or np.any(D))
     if not len(D):
         # Drivers without a calibrated lens name a model and leave D empty.
         table["distortion_model"] = "none"

@@ -1,4 +1,4 @@
-"""Points, laser numbers, times and labels of sensor_msgs/PointCloud2."""
+"""Points, laser numbers, times and labels of sensor_msgs/PointCloud2, and of Livox's CustomMsg."""
 
 from __future__ import annotations
 
@@ -9,17 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.data.arrays import MAX_POINTS
+from sst_graph.data.point_files.cloud import INTENSITIES, RINGS, TIMES
 from sst_graph.data.point_times import FARTHEST_S, seconds_after_stamp
 from sst_graph.errors import DataError, count_of
 from sst_graph.validation import FARTHEST_M
 
 POINT_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """NumPy's names of sensor_msgs/PointField datatypes."""
-
-TIME_FIELDS = ("t", "offset_time", "time", "timestamp", "time_stamp")
-"""Fields with the time of a point: of Ouster, Livox, Velodyne, Hesai and RoboSense, Livox's driver 2."""
-RING_FIELDS = ("ring", "channel")
-INTENSITY_FIELDS = ("intensity", "reflectivity")
 
 
 @dataclass(frozen=True)
@@ -47,6 +43,7 @@ def cloud_of(message: Any, stamp_ns: int, place: str, times: bool = True, labels
     """The cloud of a message.
 
     Args:
+        message: a PointCloud2, or the points of a CustomMsg (n,) by field.
         stamp_ns: the header's stamp.
         times: read the times of the points, where the message has them.
         labels: read the fields ``label`` and ``instance``, where the message has them.
@@ -56,7 +53,15 @@ def cloud_of(message: Any, stamp_ns: int, place: str, times: bool = True, labels
     """
     # What has no value as a float of 32 bits becomes inf, and is left out.
     with np.errstate(over="ignore", invalid="ignore"):
-        return _cloud(_table(message, place), stamp_ns, place, times, labels)
+        table = message if isinstance(message, np.ndarray) else _table(message, place)
+        return _cloud(table, stamp_ns, place, times, labels)
+
+
+def field_names(message: Any) -> tuple[str, ...]:
+    """Names of all fields of a message, whether they are understood or not."""
+    if isinstance(message, np.ndarray):
+        return message.dtype.names or ()
+    return tuple(str(field.name) for field in message.fields)
 
 
 def _cloud(table: NDArray[Any], stamp_ns: int, place: str, times: bool, labels: bool) -> Cloud:
@@ -78,12 +83,11 @@ def _cloud(table: NDArray[Any], stamp_ns: int, place: str, times: bool, labels: 
 
 
 def _table(message: Any, place: str) -> NDArray[Any]:
-    """The points as a table (n,) of named columns."""
-    fields = {
-        field.name: field
-        for field in message.fields
-        if int(field.datatype) in POINT_FIELD_TYPES and field.name
-    }
+    """The points as a table (n,) of columns, named in lower case."""
+    fields: dict[str, Any] = {}
+    for field in message.fields:
+        if int(field.datatype) in POINT_FIELD_TYPES and field.name:
+            fields.setdefault(field.name.lower(), field)
     if missing := [axis for axis in "xyz" if axis not in fields]:
         found = f"fields {', '.join(fields) or 'none'} without {', '.join(missing)}"
         raise DataError(place, found, "a cloud with x, y, z")
@@ -123,20 +127,22 @@ def _names(table: NDArray[Any]) -> tuple[str, ...]:
 
 
 def _rings(table: NDArray[Any]) -> NDArray[np.uint16] | None:
-    for name in RING_FIELDS:
-        if name in _names(table) and table[name].dtype.kind in "iu":
-            return np.asarray(table[name]).astype(np.uint16)
+    """Laser numbers; floats are taken where they hold such."""
+    for name in RINGS:
+        values = table[name] if name in _names(table) else None
+        if values is not None and (values == values.astype(np.uint16)).all():
+            return values.astype(np.uint16)
     return None
 
 
 def _intensities(table: NDArray[Any]) -> NDArray[np.float32] | None:
-    name = next((name for name in INTENSITY_FIELDS if name in _names(table)), None)
+    name = next((name for name in INTENSITIES if name in _names(table)), None)
     return None if name is None else np.asarray(table[name]).astype(np.float32)
 
 
 def _offsets(table: NDArray[Any], stamp_ns: int, place: str) -> NDArray[np.float32] | None:
     """Times after the stamp [s]."""
-    name = next((name for name in TIME_FIELDS if name in _names(table)), None)
+    name = next((name for name in TIMES if name in _names(table)), None)
     seconds = None if name is None else seconds_after_stamp(table[name], stamp_ns)
     if seconds is None:
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import cv2
@@ -38,6 +39,9 @@ _TO_BGR = {
 }
 """Conversions of OpenCV; what is not here is BGR already."""
 
+_BAYER = re.compile("bayer_(rggb|bggr|gbrg|grbg)")
+"""At the beginning of a format: "bayer_rggb8; jpeg compressed "."""
+
 
 def picture_of(message: Any, type_name: str, place: str) -> NDArray[np.uint8]:
     """Picture (h, w, 3) uint8 BGR of a message.
@@ -47,7 +51,7 @@ def picture_of(message: Any, type_name: str, place: str) -> NDArray[np.uint8]:
     """
     if type_name == COMPRESSED:
         _check_compressed(message, place)
-        return decoded_picture(bytes(message.data), place)
+        return _demosaiced(decoded_picture(bytes(message.data), place), str(message.format))
     rows = _rows(message, place)
     code = _TO_BGR.get(message.encoding)
     if code is None:
@@ -58,6 +62,15 @@ def picture_of(message: Any, type_name: str, place: str) -> NDArray[np.uint8]:
         # Such as an odd width, where two pixels share their colour.
         found = f"{message.width}x{message.height} px"
         raise DataError(place, found, f"a size that encoding {message.encoding} can have") from None
+
+
+def _demosaiced(picture: NDArray[np.uint8], form: str) -> NDArray[np.uint8]:
+    """The picture; of a Bayer pattern that was compressed as it is, as image_transport does, in colour."""
+    pattern = _BAYER.match(form)
+    grey = picture[..., 0]
+    if pattern is None or not (picture == grey[..., None]).all():
+        return picture
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(grey), _TO_BGR[f"{pattern[0]}8"]), np.uint8)
 
 
 def mask_of(message: Any, type_name: str, place: str) -> NDArray[np.uint8]:

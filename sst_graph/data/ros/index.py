@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.data.ros.bag import Bag, Message
+from sst_graph.data.ros.camera_info import has_matrix
 from sst_graph.data.ros.topics import Topics
 from sst_graph.data.ros.transforms import Transforms
 from sst_graph.data.source import Stamps
@@ -33,7 +34,8 @@ class BagIndex:
     Attributes:
         images, clouds, masks: of the camera and the LiDAR, stamps rising.
         image_frame, cloud_frame: names of their coordinate frames.
-        info: the first CameraInfo of a calibrated camera; the first where there is none.
+        info: the first CameraInfo of a calibrated camera; the first where there is none; None where there is
+            no topic of them.
         other_infos: how many CameraInfo describe another camera than it.
         transforms: of all TFMessages.
         repeated: messages left out because their stamp is that of another of the same topic.
@@ -68,7 +70,8 @@ def read_index(bag: Bag, topics: Topics, stamps: Stamps) -> BagIndex:
     received: list[int] = []
     models, transforms = _CameraInfos(), Transforms()
     types = bag.topics
-    for message, data in bag.messages([*topics.sensors, topics.info.name, *topics.transforms]):
+    infos = [] if topics.info is None else [topics.info.name]
+    for message, data in bag.messages([*topics.sensors, *infos, *topics.transforms]):
         if message.topic in sensors:
             stamp_ns, frame = bag.header(data)
             sensor = sensors[message.topic]
@@ -79,7 +82,7 @@ def read_index(bag: Bag, topics: Topics, stamps: Stamps) -> BagIndex:
         elif message.topic in topics.transforms:
             transforms.add(bag.decoded(data, types[message.topic].type))
         else:
-            models.add(bag, data, topics.info.type)
+            models.add(bag, data, types[message.topic].type)
     rising = {name: _rising(bag, name, sensor.stamped) for name, sensor in sensors.items()}
     masks = () if topics.mask is None else rising[topics.mask.name]
     return BagIndex(
@@ -107,14 +110,10 @@ class _CameraInfos:
     def add(self, bag: Bag, data: bytes, type_name: str) -> None:
         """Take a message."""
         content = bag.without_header(data)
-        if self.first is None or not _is_calibrated(self.first):
+        if self.first is None or not has_matrix(self.first):
             self.first, self._bytes, self.others = bag.decoded(data, type_name), content, 0
         elif content != self._bytes:
-            self.others += _is_calibrated(bag.decoded(data, type_name))
-
-
-def _is_calibrated(info: Any) -> bool:
-    return bool(np.any(getattr(info, "k", getattr(info, "K", ()))))
+            self.others += has_matrix(bag.decoded(data, type_name))
 
 
 def _rising(bag: Bag, topic: str, stamped: list[Stamped]) -> tuple[Stamped, ...]:

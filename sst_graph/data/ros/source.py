@@ -14,25 +14,28 @@ from numpy.typing import NDArray
 
 from sst_graph.cameras import Rectification
 from sst_graph.classes import MaskEncoding, guess_mask_encoding
+from sst_graph.data.arrays import listed
 from sst_graph.data.rectified import RectifiedSource
 from sst_graph.data.ros.bag import Bag, Topic
-from sst_graph.data.ros.camera_info import image_geometry
+from sst_graph.data.ros.camera_info import ImageGeometry, geometry_by_file, has_matrix, image_geometry
+from sst_graph.data.ros.clouds import field_names
 from sst_graph.data.ros.frames import CloudReading, check_size, mask_classes, scan_of
 from sst_graph.data.ros.images import mask_of, picture_of
 from sst_graph.data.ros.index import BagIndex, Stamped, read_index
 from sst_graph.data.ros.topics import Topics, choose_topics
 from sst_graph.data.source import Loader, SourceOptions
 from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
-from sst_graph.errors import DataError, count_of, printable
+from sst_graph.errors import ConfigError, DataError, count_of, printable
+from sst_graph.files.reading import path_of
 from sst_graph.sampling import evenly_spread
 from sst_graph.sweep_timing import SweepTiming
 from sst_graph.types import CameraImage, Scan, SemanticClass, Source
 
 _LOG = logging.getLogger(__name__)
 
-LAYOUT = "a bag: PATH.bag (ROS 1), PATH.mcap, PATH.db3, or a rosbag2 folder with metadata.yaml"
+LAYOUT = "a bag: PATH.bag, PATH.mcap, PATH.db3, or a rosbag2 folder"
 
-_SUFFIXES = (".bag", ".mcap", ".db3")
+_SUFFIXES, _METADATA = (".bag", ".mcap", ".db3"), "metadata.yaml"
 _MASKS_TO_JUDGE = 8
 """How many masks, spread over the drive, decide on their encoding."""
 
@@ -96,8 +99,38 @@ class BagMessages:
 
 
 def is_ros(path: Path) -> bool:
-    """Whether a path is a bag."""
-    return path.suffix in _SUFFIXES if path.is_file() else (path / "metadata.yaml").is_file()
+    """Whether a path is a bag, or a folder of some."""
+    if path.is_file():
+        return path.suffix in _SUFFIXES
+    return (path / _METADATA).is_file() or is_folder_of_bags(path)
+
+
+def is_folder_of_bags(path: Path) -> bool:
+    """Whether bags stand in a folder by themselves: one drive or several, nothing says it."""
+    return path.is_dir() and not (path / _METADATA).is_file() and bool(_bag_files(path))
+
+
+def _bag_files(path: Path) -> list[Path]:
+    """Bags that are files of a folder."""
+    return [entry for entry in listed(path, LAYOUT) if entry.suffix in _SUFFIXES and entry.is_file()]
+
+
+def _only_bag(path: Path) -> Path:
+    """The bag that a path names: itself, or the only file of a folder without metadata.yaml.
+
+    Raises:
+        DataError: no bag, or several files that nothing puts together.
+    """
+    if not is_ros(path):
+        raise DataError(path, "no file or folder" if not path.exists() else "no bag", LAYOUT)
+    if path.is_file() or (path / _METADATA).is_file():
+        return path
+    files = _bag_files(path)
+    if len(files) > 1:
+        some = ", ".join(file.name for file in files[:4]) + (", ..." if len(files) > 4 else "")
+        expected = f"{_METADATA} beside them ('ros2 bag reindex' writes it), or one of them as DATA"
+        raise DataError(path, f"{count_of(len(files), 'bag')} ({some}) without {_METADATA}", expected)
+    return files[0]
 
 
 def open_ros(path: Path, options: SourceOptions) -> Source:
@@ -111,24 +144,24 @@ def open_ros(path: Path, options: SourceOptions) -> Source:
         ConfigError: an option that means nothing for bags, or no such range of frames.
         MissingDependencyError: rosbags is not installed.
     """
-    if not is_ros(path):
-        raise DataError(path, "no file or folder" if not path.exists() else "no bag", LAYOUT)
+    path = _only_bag(path)
     bag = Bag(path)
     topics = choose_topics(path, bag.topics, options)
     index = read_index(bag, topics, options.stamps)
     _check_masks(bag, index)
     size = _size(bag, topics, index)
-    geometry = image_geometry(index.info, topics.image.name, size, f"{path}, {topics.info.name}")
+    geometry = _geometry(path, topics, index, size, options)
     oTl, reason = index.transforms.pose(index.image_frame, index.cloud_frame)
     nominal = None if oTl is None else geometry.extrinsic(oTl)
     if nominal is None:
         _LOG.info("%s: no nominal extrinsic: %s", printable(path), reason)
     encoding, timing = _encoding(bag, topics, index, options), options.timing(_stamps(index.clouds))
     messages = BagMessages(bag, topics, index, size, encoding, timing, options.sweep == "auto")
-    notes = [f"camera model from {topics.info.name}"]
+    notes = [f"camera model from {topics.info.name if topics.info else options.camera_file}"]
+    notes.append(f"fields of the clouds: {', '.join(_fields(bag, topics, index))}")
     if index.repeated:
         notes.append(f"left out {count_of(index.repeated, 'message')} with the stamp of another")
-    if index.other_infos:
+    if topics.info is not None and index.other_infos:
         others = count_of(index.other_infos, "CameraInfo", "CameraInfo")
         notes.append(f"{others} of {topics.info.name} of another camera than the first, whose model is taken")
         _LOG.warning("%s: %s", printable(path), notes[-1])
@@ -161,6 +194,22 @@ def _check_masks(bag: Bag, index: BagIndex) -> None:
         raise DataError(place, f"masks at other stamps, such as {first.stamp_ns} ns", expected)
 
 
+def _geometry(
+    path: Path, topics: Topics, index: BagIndex, size: tuple[int, int], options: SourceOptions
+) -> ImageGeometry:
+    """Of the images: by the file that the options name, or by their CameraInfo."""
+    if options.camera_file is not None:
+        if options.info_topic is not None:
+            raise ConfigError(f"--info-topic {options.info_topic}: means nothing with --camera-file")
+        return geometry_by_file(path_of(options.camera_file, "a camera"), topics.image.name, size)
+    assert topics.info is not None
+    place = f"{path}, {topics.info.name}"
+    if not has_matrix(index.info):
+        expected = "a calibrated one, or its file (--camera-file)"
+        raise DataError(place, "K = 0, an uncalibrated camera", expected)
+    return image_geometry(index.info, topics.image.name, size, place)
+
+
 def _size(bag: Bag, topics: Topics, index: BagIndex) -> tuple[int, int]:
     """Width and height of the first image [px]."""
     first, type_name = index.images[0], topics.image.type
@@ -168,6 +217,11 @@ def _size(bag: Bag, topics: Topics, index: BagIndex) -> tuple[int, int]:
         _read(bag, topics, index, first, type_name), type_name, _place(bag, first)
     ).shape[:2]
     return width, height
+
+
+def _fields(bag: Bag, topics: Topics, index: BagIndex) -> tuple[str, ...]:
+    """Names of what the first cloud holds for each point."""
+    return field_names(_read(bag, topics, index, index.clouds[0], topics.cloud.type))
 
 
 def _encoding(bag: Bag, topics: Topics, index: BagIndex, options: SourceOptions) -> MaskEncoding | None:

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sst_graph.data.ros.bag import TF_MESSAGE, Topic
+from sst_graph.data.ros.livox import CUSTOM
 from sst_graph.data.source import SourceOptions
 from sst_graph.errors import DataError
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CLOUD, INFO = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/CameraInfo"
 
-_TRANSFORMS = (TF_MESSAGE, "tf/msg/tfMessage")
 _LISTED = 12
 """Topics that an error lists at most."""
 _MASK_WORDS = ("mask", "label", "semantic", "segment")
@@ -25,14 +25,15 @@ class Topics:
     """Topics that a drive is read from.
 
     Attributes:
-        image, cloud, info: of the camera, the LiDAR and the camera's model.
+        image, cloud: of the camera and the LiDAR.
+        info: of the camera's model; None where a file has it.
         mask: of the semantic masks, or None.
         transforms: names of those with TFMessage.
     """
 
     image: Topic
     cloud: Topic
-    info: Topic
+    info: Topic | None
     mask: Topic | None
     transforms: tuple[str, ...]
 
@@ -63,10 +64,10 @@ def choose_topics(path: Path, topics: Mapping[str, Topic], options: SourceOption
         mask = _named(path, filled, name, kinds, "--mask-topic")
     return Topics(
         image=image,
-        cloud=_one(path, filled, options.cloud_topic, "--cloud-topic", (CLOUD,)),
-        info=_info(path, filled, options.info_topic, image),
+        cloud=_one(path, filled, options.cloud_topic, "--cloud-topic", (CLOUD, CUSTOM)),
+        info=None if options.camera_file is not None else _info(path, filled, options.info_topic, image),
         mask=mask,
-        transforms=tuple(name for name, topic in filled.items() if topic.type in _TRANSFORMS),
+        transforms=tuple(name for name, topic in filled.items() if topic.type == TF_MESSAGE),
     )
 
 
@@ -98,7 +99,8 @@ def _one(
     if not fitting:
         raise DataError(path, f"no topic of {what} among {listed(topics.values())}", "one")
     masks = [topic.name for topic in fitting if any(word in topic.name for word in _MASK_WORDS)]
-    hint = f"; of masks by --mask-topic {masks[0]}" if masks else ""
+    hint = "; several cameras by --camera" if option == "--image-topic" else ""
+    hint = f"; of masks by --mask-topic {masks[0]}" if masks else hint
     raise DataError(path, f"several topics of {what}: {listed(fitting)}", f"one, named by {option}{hint}")
 
 
@@ -107,6 +109,9 @@ def _info(path: Path, topics: Mapping[str, Topic], name: str | None, image: Topi
         beside = topics.get(_namespace(image.name) + "/camera_info")
         if beside is not None and beside.type == INFO:
             return beside
+    if name is None and not any(topic.type == INFO for topic in topics.values()):
+        found = f"no topic of {INFO} among {listed(topics.values())}"
+        raise DataError(path, found, "one, or the camera in a file (--camera-file)")
     return _one(path, topics, name, "--info-topic", (INFO,))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -77,7 +78,7 @@ def test_two_image_topics_are_listed_and_one_is_chosen(
     path = made(tmp_path, fill, rear)
     line = refused(capsys, path)
     assert "/front/image_rect (sensor_msgs/Image, 4), /rear/image (sensor_msgs/Image, 1)" in line
-    assert line.endswith("expected one, named by --image-topic")
+    assert line.endswith("expected one, named by --image-topic; several cameras by --camera")
     assert main(["info", str(path), "--image-topic", "/rear/image"]) == 0
     assert "1 in /rear/image" in capsys.readouterr().out
 
@@ -172,6 +173,55 @@ def test_images_of_a_lens_that_distorts_are_rectified(tmp_path: Path) -> None:
     assert pictures and all((picture == rectification.picture(PIXELS)).all() for picture in pictures)
 
 
+PLAIN = "fx: 31\nfy: 32\ncx: 16\ncy: 12\nwidth: 32\nheight: 24\n"
+LENS = "distortion_model: plumb_bob\ndistortion: [-0.1, 0, 0, 0]\n"
+CHAIN = """
+cam0: {intrinsics: [30, 30, 16, 12], resolution: [32, 24], rostopic: /rear/image_raw}
+cam1: {intrinsics: [31, 32, 16, 12], resolution: [32, 24], rostopic: %s}
+"""
+
+
+def test_a_file_stands_in_the_place_of_a_missing_or_empty_camera_info(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def without_calibration(bag: BagWriter) -> None:
+        bag.add(INFO, bag.messages.info(CAMERA, k=np.zeros(9), p=np.zeros(12)), EPOCH_NS)
+        fill(bag, leave_out=[INFO])
+
+    (tmp_path / "a").mkdir()
+    missing = made(tmp_path / "a", lambda bag: fill(bag, leave_out=[INFO]))
+    assert "the camera in a file (--camera-file)" in refused(capsys, missing)
+    empty = made(tmp_path, without_calibration)
+    assert "K = 0, an uncalibrated camera, expected a calibrated one, or its file" in refused(capsys, empty)
+    file = tmp_path / "camera.yaml"
+    for bag in (missing, empty):
+        for text in (PLAIN, CHAIN % IMAGE, CHAIN % "/front/image_raw/compressed"):
+            file.write_text(text)
+            source = open_source(bag, camera_file=str(file))
+            assert source.camera == PinholeCamera(31.0, 32.0, 16.0, 12.0, 32, 24)
+    assert main(["info", str(missing), "--camera-file", str(file)]) == 0
+    assert f"camera model from {file}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (PLAIN.replace("32\nh", "64\nh"), "64x24 px, expected 32x24 px, the size of the images"),
+        (PLAIN + LENS, "a plumb_bob lens for /front/image_rect, whose name says"),
+        (CHAIN % "/left/image_raw", "cam0 (/rear/image_raw), cam1 (/left/image_raw), expected one of"),
+        ("a: 1\n", "found keys a, expected fx, fy, cx, cy"),
+    ],
+)
+def test_files_that_are_not_the_camera_of_the_images(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, words: str
+) -> None:
+    path, file = made(tmp_path, fill), tmp_path / "camera.yaml"
+    file.write_text(text)
+    assert words in refused(capsys, path, "--camera-file", str(file))
+    found = refused(capsys, path, "--camera-file", str(file), "--info-topic", INFO)
+    assert f"--info-topic {INFO}: means nothing with --camera-file" in found
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_camera_whose_model_changes_is_reported(
     tmp_path: Path, kind: Kind, caplog: pytest.LogCaptureFixture
@@ -220,6 +270,35 @@ def test_options_of_other_formats(
     assert "--sequence 1: means nothing for" in refused(capsys, path, "--sequence", "1")
     assert "--mask-topic /m: means nothing for" in refused(capsys, kitti_drive, "--mask-topic", "/m")
     assert "the drive has frames 0:4" in refused(capsys, path, "--frames", "3:9")
+
+
+@pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
+def test_a_folder_whose_recording_was_ended_before_its_metadata(
+    kind: Kind, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One file is the bag; several are put together by ROS, which knows how."""
+    path = made(tmp_path, fill, kind=kind)
+    whole = open_source(path)
+    (path / "metadata.yaml").unlink()
+    alone = open_source(path)
+    stamps = [[frame.scan.stamp_ns for frame in drive if frame.scan is not None] for drive in (alone, whole)]
+    assert len(stamps[0]) == 4 and stamps[0] == stamps[1]
+    (only,) = files_of(path, {"mcap": ".mcap", "sqlite3": ".db3"}[kind])
+    shutil.copy(only, path / f"later{only.suffix}")
+    found = refused(capsys, path)
+    assert "found 2 bags (drive" in found and "'ros2 bag reindex' writes it" in found
+
+
+def test_an_mcap_file_of_other_messages_than_those_of_ros_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = made(tmp_path, fill)
+    (only,) = files_of(path, ".mcap")
+    data = only.read_bytes()
+    assert data[21:25] == b"ros2"
+    other = tmp_path / "other.mcap"
+    other.write_bytes(data[:21] + b"ros1" + data[25:])
+    assert "found MCAP of profile 'ros1', expected profile 'ros2'" in refused(capsys, other)
 
 
 def test_what_is_no_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -69,6 +69,20 @@ def test_bayer_patterns_give_the_colour_of_the_scene(pattern: str) -> None:
     )
 
 
+@pytest.mark.parametrize("form", ["bayer_{}8; png compressed ", "bayer_{}16; png compressed", "{}8", "mono8"])
+def test_bayer_patterns_that_were_compressed_as_they_are(form: str) -> None:
+    for pattern in ("rggb", "bggr", "gbrg", "grbg"):
+        mosaic = RNG.integers(0, 255, (8, 10), dtype=np.uint8)
+        data = cv2.imencode(".png", mosaic)[1].tobytes()
+        found = picture_of(MAKE.compressed(STAMP_NS, data, form.format(pattern)), COMPRESSED, "here")
+        plain = MAKE.image(STAMP_NS, mosaic, f"bayer_{pattern}8" if "bayer" in form else "mono8")
+        np.testing.assert_array_equal(found, picture_of(plain, IMAGE, "here"))
+    # A camera's driver may have made it colours before.
+    data = cv2.imencode(".png", BGR)[1].tobytes()
+    colours = MAKE.compressed(STAMP_NS, data, "bayer_rggb8; png compressed bgr8")
+    np.testing.assert_array_equal(picture_of(colours, COMPRESSED, "here"), BGR)
+
+
 def test_compressed_pictures_and_masks() -> None:
     data = cv2.imencode(".png", BGR)[1].tobytes()
     np.testing.assert_array_equal(picture_of(MAKE.compressed(STAMP_NS, data), COMPRESSED, "here"), BGR)
@@ -143,6 +157,30 @@ def test_times_of_points(name: str, values: np.ndarray[Any, Any]) -> None:
     assert read(table(**{name: values}), times=False).offsets_s is None
 
 
+@pytest.mark.parametrize(
+    "rings", [np.arange(5, dtype=kind) for kind in ("u1", "<u2", "<i4", "<f4", "<f8")], ids=lambda r: r.dtype
+)
+@pytest.mark.parametrize("names", [("ring", "time"), ("Ring", "T"), ("channel", "time_stamp")])
+def test_names_and_types_of_rings_and_times(rings: np.ndarray[Any, Any], names: tuple[str, str]) -> None:
+    cloud = read(table(**{names[0]: rings, names[1]: SECONDS}))
+    assert cloud.rings is not None and cloud.offsets_s is not None
+    np.testing.assert_array_equal(cloud.rings, np.arange(5, dtype=np.uint16))
+    np.testing.assert_allclose(cloud.offsets_s, SECONDS, atol=5e-7)
+
+
+@pytest.mark.parametrize("values", [np.arange(5) - 1.0, np.arange(5) + 0.5, np.full(5, np.nan)])
+def test_fields_called_ring_that_hold_no_laser_numbers_are_passed_over(values: np.ndarray[Any, Any]) -> None:
+    assert read(table(ring=values)).rings is None
+    assert read(table(ring=values, laser_id=np.arange(5, dtype=np.uint8))).rings is not None
+
+
+def test_two_fields_whose_names_differ_in_case_only() -> None:
+    """The first is taken."""
+    cloud = read(table(t=SECONDS, T=np.full(5, 20.0)))
+    assert cloud.offsets_s is not None
+    np.testing.assert_allclose(cloud.offsets_s, SECONDS, atol=5e-7)
+
+
 def test_times_before_the_stamp() -> None:
     cloud = read(table(time=-SECONDS.astype("<f4")))
     assert cloud.offsets_s is not None
@@ -160,8 +198,10 @@ def test_times_too_close_for_a_scan_in_any_unit_have_the_usual_one(values: np.nd
 
 
 @pytest.mark.parametrize("kind", ["<f4", "<f8", "<u4"])
-def test_times_that_are_all_0_are_none(kind: str) -> None:
-    assert read(table(time=np.zeros(5, kind))).offsets_s is None
+@pytest.mark.parametrize("value", [0, 1_700_000_000])
+def test_times_that_are_all_the_same_are_none(kind: str, value: int) -> None:
+    """Also absolute seconds as floats of 32 bits, which round to one value."""
+    assert read(table(time=np.full(5, value, kind))).offsets_s is None
 
 
 def test_times_of_another_clock_are_refused() -> None:
@@ -314,7 +354,11 @@ def test_cameras_that_cannot_be_used() -> None:
         with pytest.raises(DataError, match="here: R"):
             image_geometry(MAKE.info(CAMERA, r=R), "/cam/image_rect", (640, 360), "here")
     with pytest.raises(DataError, match="P = 0, an uncalibrated camera"):
-        image_geometry(MAKE.info(CAMERA, p=np.zeros(12)), "/cam/image_rect", (640, 360), "here")
+        image_geometry(replace(distorted, p=np.zeros(12)), "/cam/image_rect", (640, 360), "here")
+    only_K = MAKE.info(CAMERA, p=np.zeros(12), r=np.zeros(9))
+    for D in (np.zeros(5), np.zeros(0)):
+        found = image_geometry(replace(only_K, d=D), "/cam/image_rect", (640, 360), "here").model
+        assert found == BrownConradyCamera(CAMERA)
     with pytest.raises(DataError, match="binning"):
         image_geometry(MAKE.info(CAMERA, binning_x=2), "/cam/image_raw", (640, 360), "here")
 

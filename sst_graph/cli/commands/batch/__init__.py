@@ -15,6 +15,7 @@ from sst_graph.cli.inputs import calibration_settings
 from sst_graph.cli.messages import complain, mention
 from sst_graph.cli.options import SOURCE_DEFAULTS
 from sst_graph.cli.reading import check_options
+from sst_graph.data.ros.source import is_folder_of_bags
 from sst_graph.data.source import recognized
 from sst_graph.errors import ConfigError, count_of
 from sst_graph.fleet import (
@@ -145,7 +146,9 @@ def _check_apart(drives: list[Drive], out: Place) -> None:
 def _say_if_a_drive(what: str, drives: list[Drive]) -> None:
     """Tell who gives one drive in the place of a folder of drives."""
     place = Place.of(what)
-    if place.is_local and place.is_folder() and (kind := recognized(place.path)) is not None:
+    if not (place.is_local and place.is_folder()) or is_folder_of_bags(place.path):
+        return
+    if (kind := recognized(place.path)) is not None:
         parts = ", ".join(drive.place.name for drive in drives[:3]) + (", ..." if len(drives) > 3 else "")
         complain(
             f"note: {what} looks like one drive ({kind}); what stands in it ({parts}) is taken for the "
