@@ -48,6 +48,7 @@ IntArray = NDArray[np.intp]
 MotionModel = Literal["se3", "translation"]
 
 _TERMS = 10
+"""Of the power series."""
 _SERIES_LIMIT = 1.0
 """Below this squared angle [rad^2] the power series (exact to 1e-16) replaces the closed forms."""
 

@@ -36,6 +36,7 @@ from sst_graph.initialization.label_agreement import States
 from sst_graph.types import FloatArray, IntArray, SemanticClass
 
 _MIN_DEPTH_M = 0.5
+"""Nearer points are not projected: no object is so close [m]."""
 _REACH_M = 3.0
 """Farthest that a point moves between its scan and its image [m]: 30 m/s for a tenth of a second."""
 _MIN_OBJECT_SHARE = 0.3

@@ -1,10 +1,11 @@
 """The start of the joint method: candidates, refined side by side, and the best of them selected.
 
 1. Candidates: poses of a grid whose labels agree (:mod:`~sst_graph.initialization.candidates`).
-2. Refinement: all of them by silhouettes on some scans, under narrowing kernels; the worse ones, and those
-that have converged to one pose, are dropped from stage to stage
-(:mod:`~sst_graph.initialization.refinement`). 3. Selection: the best by silhouettes and by the labels of all
-points, and alternatives that are nearly as good.
+2. Refinement (:mod:`~sst_graph.initialization.refinement`): all of them by silhouettes on some scans, under
+   narrowing kernels; the worse ones, and those that have converged to one pose, are dropped from stage to
+   stage.
+3. Selection: the best by silhouettes and by the labels of all points, and alternatives that are nearly as
+   good.
 """
 
 from __future__ import annotations

@@ -417,7 +417,7 @@ class ChangeDetector:
 
         They must do so with any one object left out, too. Where a single object contradicts, its labels may
         be wrong: with one object in view, or one of dominant weight, it must do so for longer and far above
-            the threshold.
+        the threshold.
         """
         scans = [scan for scan in self.scans if scan >= reference.scan]
         pairs = self.matcher.pairs_at(reference.point, scans, _KERNEL)
