@@ -9,12 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.features.image_edges import Picture, PictureEdges, find_picture_edges
+from sst_graph.features.image_edges import FloatMap, Picture, PictureEdges, find_picture_edges
 from sst_graph.features.sampling import sampled
 from sst_graph.files.array_store import ArrayStore, shape_of, storable
 from sst_graph.types import FloatArray, IntArray, PixelStretch, SemanticClass
-
-FloatMap = NDArray[np.float32]
 
 _SMOOTHING_PX = 1.0
 """Gaussian smoothing of the distances [px]: a mask's contour is a staircase of pixels."""

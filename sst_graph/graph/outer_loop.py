@@ -328,6 +328,11 @@ def agreement(solution: JointSolution) -> float:
     return support(solution) ** 2 / _seen(solution)
 
 
+def still_moved(outer_iterations: int) -> str:
+    """Why a solution that did not converge may be wrong."""
+    return f"the outer loop still moved after {count_of(outer_iterations, 'iteration')}"
+
+
 def poor_fit(explained: float, concentration: float, rotation_observable: bool) -> list[str]:
     """Reasons why a solution may be wrong altogether; none for one that explains the labels.
 

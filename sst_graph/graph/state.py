@@ -115,6 +115,12 @@ def difference(a: State, b: State) -> FloatArray:
     return np.append(gtsam.Pose3.Logmap(a.cTl.between(b.cTl)), b.time_offsets_s[0] - a.time_offsets_s[0])
 
 
+def step_text(step: FloatArray) -> str:
+    """A step (7,) [rad, m, s] in a sentence: "0.10 deg, 1.2 cm and +3.4 ms"."""
+    rotation, translation = np.linalg.norm(step[:3]), np.linalg.norm(step[3:6])
+    return f"{np.degrees(rotation):.2f} deg, {100.0 * translation:.1f} cm and {1e3 * step[6]:+.1f} ms"
+
+
 def _interpolated(a: Mapping[_Key, float], b: Mapping[_Key, float], share: float) -> dict[_Key, float]:
     """From a (share 0) to b (1); what a does not have is as in b."""
     return {key: (1.0 - share) * a.get(key, value) + share * value for key, value in b.items()}

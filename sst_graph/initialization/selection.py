@@ -25,6 +25,7 @@ from sst_graph.initialization.candidates import StartProblem, candidate_steps, l
 from sst_graph.initialization.global_search import Candidate, SearchConfig
 from sst_graph.initialization.pose_batch import BatchEquations, Poses
 from sst_graph.initialization.refinement import RefinementProblem, refine_steps
+from sst_graph.metrics import turn_rad
 from sst_graph.sampling import evenly_spread
 from sst_graph.stepwise import Stepwise
 from sst_graph.types import Calibration, FloatArray, IntArray
@@ -259,8 +260,3 @@ def _in_reach(poses: Poses, guess: gtsam.Pose3 | None, config: SearchConfig) -> 
         return np.asarray(np.linalg.norm(poses.translations, axis=1) < REACH * config.free_translation_m)
     away = np.abs(poses.translations - np.asarray(guess.translation()))
     return np.asarray((away < REACH * config.translation_m).all(axis=1))
-
-
-def turn_rad(one: gtsam.Pose3, other: gtsam.Pose3) -> float:
-    """Angle between two rotations [rad]."""
-    return float(np.linalg.norm(gtsam.Rot3.Logmap(one.rotation().between(other.rotation()))))

@@ -30,7 +30,8 @@ from sst_graph.graph.outer_loop import (
 )
 from sst_graph.graph.state import State
 from sst_graph.initialization.candidates import StartProblem
-from sst_graph.initialization.selection import select_start_steps, turn_rad
+from sst_graph.initialization.selection import select_start_steps
+from sst_graph.metrics import turn_rad
 from sst_graph.stepwise import Stepwise
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.start.first_estimate import FirstEstimate, StartGuess

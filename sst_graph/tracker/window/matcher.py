@@ -170,7 +170,7 @@ class WindowMatcher:
         """The dynamic objects of a scan whose weight is lower with the image of a pair, or 0."""
         return self.window.left_out(number, time_offset_s + pair.pair.base_tau_s, DYNAMIC_REACH_M)
 
-    def objects_of(self, chosen: Collection[int]) -> set[int]:
+    def tracks_of(self, chosen: Collection[int]) -> set[int]:
         """Tracks of all objects of some scans."""
         return {track for number in chosen for track in self.window.tracks.get(number, {}).values()}
 

@@ -24,7 +24,7 @@ from sst_graph.types import RelativeMotion, SemanticClass
 FARTHEST_NS = 86_400 * 10**9
 """A stamp that is farther ahead of the one before is an error, not a pause: a day [ns]."""
 OBJECT_MEMORY = 50
-"""Scans after which an object that was not seen again is another one."""
+"""Scans after which an object that was not seen again is another one, and its sides are closed."""
 
 
 @dataclasses.dataclass(frozen=True)
