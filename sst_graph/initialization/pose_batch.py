@@ -213,7 +213,7 @@ class PoseBatch:
         shifts = np.rint(1e9 * offsets).astype(np.int64)[:, None]
         near, which = np.unique((stamps[images] + shifts)[seen] // _NEAR_NS, return_inverse=True)
         instants = (near * _NEAR_NS + _NEAR_NS // 2).tolist()
-        samples = self.edges.tracks.at_all(self.edges.number, instants)
+        samples = self.edges.motion.at_all(instants)
         if samples is None or not samples.twists.any():
             return _Pairing(images, taus, None, None)
         twists, accelerations = np.zeros((2, *images.shape, 6))

@@ -130,7 +130,7 @@ def select_among_steps(
     """
     # 1. All candidates under wide kernels, on some of the points.
     few = [replace(drive, scans=tuple(evenly_spread(drive.scans, most_scans))) for drive in problem.drives]
-    full = RefinementProblem.of(edges_of(few, problem.tracks, graph), graph)
+    full = RefinementProblem.of(edges_of(few, problem.motions, graph), graph)
     rough = full.thinned(_WIDE_POINTS)
     yield 10
     poses = _poses(_with_offsets(candidates, problem.guess.time_offset_s), full.biases)

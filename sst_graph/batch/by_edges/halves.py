@@ -70,10 +70,10 @@ def _half(
     """A half's own estimate, as a step from that of the whole; None where it has none."""
     if len(scans) < _LEAST_SCANS:
         return None
-    drive, tracks = problem.drives[number].part(scans), problem.tracks.part(number, scans)
+    drive, motion = problem.drives[number].part(scans), problem.motions[number].part(scans)
     few = evenly_spread(range(len(scans)), _SEARCHED_SCANS)
-    some = replace(problem, drives=[drive.part(few)], tracks=tracks.part(0, few))
-    edges = edges_of(some.drives, some.tracks, problem.config.graph)
+    some = replace(problem, drives=[drive.part(few)], motions=[motion.part(few)])
+    edges = edges_of(some.drives, some.motions, problem.config.graph)
     if not edges:
         return None
     # 1. Every start on a few scans.
@@ -93,7 +93,7 @@ def _half(
     # 2. The best of them on all.
     best = max(found, key=lambda one: one[0])[1]
     try:
-        best = solve_joint(replace(problem, drives=[drive], tracks=tracks), best, NEAR_KERNELS_PX).state
+        best = solve_joint(replace(problem, drives=[drive], motions=[motion]), best, NEAR_KERNELS_PX).state
     except EstimationError:
         return None
     return PartEstimate(difference(state, best), 2.0 * covariance, float(SAMPLES))

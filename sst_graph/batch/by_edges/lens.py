@@ -191,7 +191,7 @@ def _near(problem: JointProblem, start: State) -> Stepwise[State]:
 def _support(problem: JointProblem, *states: State) -> list[float]:
     """How many edges are met at each state, by their robust weights."""
     kernel = RobustKernel("geman_mcclure", NEAR_KERNELS_PX[-1])
-    edges = edges_of(problem.drives, problem.tracks, problem.config.graph)
+    edges = edges_of(problem.drives, problem.motions, problem.config.graph)
     return [sum(support_of(match_all(edges, state, kernel), state).values()) for state in states]
 
 
