@@ -119,8 +119,8 @@ def exponential_coefficients(x: FloatArray) -> FloatArray:
 def twist_ad(xi: FloatArray) -> FloatArray:
     """(..., 6, 6) matrices ad(xi) of twists (..., 6) [omega, v]."""
     ad = np.zeros((*xi.shape, 6))
-    ad[..., :3, :3] = ad[..., 3:, 3:] = _skew(xi[..., :3])
-    ad[..., 3:, :3] = _skew(xi[..., 3:])
+    ad[..., :3, :3] = ad[..., 3:, 3:] = skew(xi[..., :3])
+    ad[..., 3:, :3] = skew(xi[..., 3:])
     return ad
 
 
@@ -129,7 +129,7 @@ def se3_left_jacobian(xi: FloatArray) -> FloatArray:
     return np.asarray(gtsam.Pose3.ExpmapDerivative(-xi))
 
 
-def _skew(a: FloatArray) -> FloatArray:
+def skew(a: FloatArray) -> FloatArray:
     """(..., 3, 3) matrices [a]_x of vectors (..., 3)."""
     return np.asarray(a @ _SKEW).reshape(*a.shape, 3)
 
