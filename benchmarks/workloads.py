@@ -15,8 +15,9 @@ import numpy as np
 from sst_graph.association.nearest import ClassView
 from sst_graph.drive.preparation import Drive, PrepareConfig, prepare_drive
 from sst_graph.factors import Alignment, PinholeCamera, RobustKernel
+from sst_graph.graph.drive_motion import DriveMotion
 from sst_graph.graph.frozen_problem import FrozenProblem
-from sst_graph.graph.matching import DriveEdges, DriveMatches, GraphConfig, Tracks
+from sst_graph.graph.matching import DriveEdges, DriveMatches, GraphConfig
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
@@ -93,8 +94,8 @@ class DriveWork:
     def of(cls, source: SimulatedDrive, prepared: Drive | None = None) -> DriveWork:
         """With the settings of ``calibrate``; the drive is read unless it is given."""
         drive = prepared or prepare_drive(source, [VEHICLE], PrepareConfig(use_visual_odometry=False))
-        tracks = Tracks([drive], [object_tracks(drive)])
-        edges = DriveEdges.of(0, drive, tracks, GraphConfig())
+        motion = DriveMotion.of(drive, object_tracks(drive))
+        edges = DriveEdges.of(0, drive, motion, GraphConfig())
         assert edges is not None and source.truth.time_offset_s is not None
         return cls(edges, State(source.truth.cTl.retract(OFF), (source.truth.time_offset_s + 0.002,)))
 

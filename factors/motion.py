@@ -27,7 +27,7 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import gtsam
 import numpy as np
@@ -48,6 +48,7 @@ IntArray = NDArray[np.intp]
 MotionModel = Literal["se3", "translation"]
 
 _TERMS = 10
+"""Of the power series."""
 _SERIES_LIMIT = 1.0
 """Below this squared angle [rad^2] the power series (exact to 1e-16) replaces the closed forms."""
 
@@ -118,8 +119,8 @@ def exponential_coefficients(x: FloatArray) -> FloatArray:
 def twist_ad(xi: FloatArray) -> FloatArray:
     """(..., 6, 6) matrices ad(xi) of twists (..., 6) [omega, v]."""
     ad = np.zeros((*xi.shape, 6))
-    ad[..., :3, :3] = ad[..., 3:, 3:] = _skew(xi[..., :3])
-    ad[..., 3:, :3] = _skew(xi[..., 3:])
+    ad[..., :3, :3] = ad[..., 3:, 3:] = skew(xi[..., :3])
+    ad[..., 3:, :3] = skew(xi[..., 3:])
     return ad
 
 
@@ -128,7 +129,7 @@ def se3_left_jacobian(xi: FloatArray) -> FloatArray:
     return np.asarray(gtsam.Pose3.ExpmapDerivative(-xi))
 
 
-def _skew(a: FloatArray) -> FloatArray:
+def skew(a: FloatArray) -> FloatArray:
     """(..., 3, 3) matrices [a]_x of vectors (..., 3)."""
     return np.asarray(a @ _SKEW).reshape(*a.shape, 3)
 
@@ -264,7 +265,6 @@ class PointwiseMoved:
     Attributes:
         lPs, cPs: (3, n) points in the LiDAR, and in the camera at the image's instant, both where the objects
             they lie on have moved by themselves until then [m].
-        lift: None, :meth:`write_rows` gives the derivatives themselves.
         taus_s: (n,) interval of each point [s].
         cRl: (3, 3) rotation of the LiDAR in the camera, before the motion.
         xis: (6, n) twist of the displacement, -tau w.
@@ -273,9 +273,11 @@ class PointwiseMoved:
         l_velocities: (3, n) of the objects [m/s], or None.
     """
 
+    lift: ClassVar[None] = None
+    """:meth:`write_rows` gives the derivatives themselves."""
+
     lPs: FloatArray
     cPs: FloatArray
-    lift: None
     taus_s: FloatArray
     cRl: FloatArray
     xis: FloatArray
@@ -377,7 +379,7 @@ def moved_points(
     rates = twists - changes
     exponential = None if model == "translation" else _Exponential.of(xis)
     cPs = cPs + xis[3:] if exponential is None else _move(xis, exponential, cPs)
-    return PointwiseMoved(lPs, cPs, None, taus_s, R, xis, rates, exponential, l_velocities)
+    return PointwiseMoved(lPs, cPs, taus_s, R, xis, rates, exponential, l_velocities)
 
 
 def _move_rigidly(

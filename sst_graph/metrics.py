@@ -89,6 +89,11 @@ def quaternion_angle_deg(estimate: gtsam.Rot3, truth: gtsam.Rot3) -> float:
     return float(np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(estimate.between(truth)))))
 
 
+def turn_rad(a: gtsam.Pose3, b: gtsam.Pose3) -> float:
+    """Angle between the rotations of two poses [rad]."""
+    return float(np.linalg.norm(gtsam.Rot3.Logmap(a.rotation().between(b.rotation()))))
+
+
 def euler_angles_deg(cRl: gtsam.Rot3) -> FloatArray:
     """(3,) roll, pitch, yaw [deg] of the LiDAR in the camera turned to vehicle axes.
 

@@ -59,11 +59,11 @@ def main() -> None:
     truth = source.truth
     assert truth is not None
     problem = CalibrationProblem.of(prepare_drives([source], config), Guess(truth.cTl, 0.0), config)
-    drive, tracks = thinned(problem.drives[0], POINTS_A_SCAN), problem.tracks
+    drive, motion = thinned(problem.drives[0], POINTS_A_SCAN), problem.motions[0]
     speeds = np.array([np.linalg.norm(each.mean_twist[3:]) for each in drive.lidar_motions])
 
     def scores(part: Drive, scans: list[int]) -> FloatArray:
-        edges = edges_of([part.part(scans)], tracks.part(0, scans), config.joint.graph)
+        edges = edges_of([part.part(scans)], [motion.part(scans)], config.joint.graph)
         states = [State(truth.cTl, (truth.time_offset_s + 1e-3 * ms,)) for ms in OFFSETS_MS]
         return np.array([score(edges, state, BLUR_PX) for state in states])
 

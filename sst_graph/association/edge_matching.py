@@ -362,12 +362,12 @@ def match_edges(
         uvs = ideal + shift
     index = np.flatnonzero(paired.camera.in_image(uvs))
     some, uvs = paired.take(index), uvs.take(index, axis=0)
-    tips = some.projected(some.points.outward, cTl, time_offset_s, poses)
+    outer = some.projected(some.points.outward, cTl, time_offset_s, poses)
     objects_seen = np.bincount(some.owners)
     # 2. Find the nearest contours within the gate.
     if any(isinstance(contour, PictureGradients) for contour in paired.contours):
-        ways = tips - (uvs if shift is None else ideal.take(index, axis=0))
-        feet, shares = _contours_or_gradients(some, uvs, ways, kernel, config.edge_place)
+        steps = outer - (uvs if shift is None else ideal.take(index, axis=0))
+        feet, shares = _contours_or_gradients(some, uvs, steps, kernel, config.edge_place)
     else:
         maps = [contour for contour in paired.contours if isinstance(contour, ContourMap)]
         feet, shares = nearest_contours(maps, some.spans, uvs), None
@@ -376,14 +376,14 @@ def match_edges(
     residuals = distances + some.repeated(some.biases_px)
     near = np.flatnonzero(feet.valid & (np.abs(residuals) < GATE * kernel.scale))
     index, owners = index.take(near), some.owners.take(near)
-    rows = uvs, tips, feet.normals, feet.feet
-    uvs, tips, normals, pixels = (each.take(near, axis=0) for each in rows)
+    rows = uvs, outer, feet.normals, feet.feet
+    uvs, outer, normals, pixels = (each.take(near, axis=0) for each in rows)
     # 3. Keep contours that face the outward direction of the object.
     if shift is not None and deviation is not None:
         own, moved = deviation.take(index), some.take(near)
-        tips = tips + _pixel_shift(own, moved, tips, _effect(own, moved, tips))
+        outer = outer + _pixel_shift(own, moved, outer, _effect(own, moved, outer))
         pixels = pixels - shift.take(index, axis=0)
-    outward = tips - uvs
+    outward = outer - uvs
     length = np.sqrt(np.vecdot(outward, outward))
     outward = outward / np.maximum(length, 1e-9)[:, None]
     cosine = np.vecdot(outward, normals)
@@ -420,12 +420,12 @@ def match_edges(
 
 
 def _contours_or_gradients(
-    paired: PairedEdges, uvs: FloatArray, ways: FloatArray, kernel: RobustKernel, place: EdgePlace
+    paired: PairedEdges, uvs: FloatArray, steps: FloatArray, kernel: RobustKernel, place: EdgePlace
 ) -> tuple[ContourFeet, FloatArray]:
     """Contours of masks for the groups that have one, edges of the picture for the others.
 
     Args:
-        ways: (n, 2) outward in the image, of any length [px].
+        steps: (n, 2) outward across the edges, in the image [px].
         place: as :func:`~sst_graph.features.picture_gradients.nearest_edges` has it.
 
     Returns:
@@ -438,9 +438,9 @@ def _contours_or_gradients(
         index = np.flatnonzero(paired.by_masks == masks)
         if len(index) == 0:
             continue
-        some, own, way = paired, uvs, ways
+        some, own, step = paired, uvs, steps
         if len(index) < n:
-            some, own, way = paired.take(index), uvs.take(index, axis=0), ways.take(index, axis=0)
+            some, own, step = paired.take(index), uvs.take(index, axis=0), steps.take(index, axis=0)
         groups = [
             (each, span) for each, span in zip(some.contours, some.spans, strict=True) if span[1] > span[0]
         ]
@@ -450,8 +450,8 @@ def _contours_or_gradients(
             found.append((index, nearest_contours(maps, spans, own), np.ones(len(index))))
             continue
         pictures = [each for each, _ in groups if isinstance(each, PictureGradients)]
-        right, down = way.T
-        outward = way / np.maximum(np.sqrt(right**2 + down**2), 1e-9)[:, None]
+        right, down = step.T
+        outward = step / np.maximum(np.sqrt(right**2 + down**2), 1e-9)[:, None]
         # The window is where the residual is 0.
         bias = some.repeated(some.biases_px)
         edges = nearest_edges(pictures, spans, own + bias[:, None] * outward, outward, kernel.scale, place)

@@ -34,10 +34,10 @@ def baseline_method(
     at, step = solution.calibration, solution.remaining_step
     second = search_again(solution.frames, drives, config.classes, start, at, config.search)
     return MethodEstimate(
-        at.cTl,
-        at.time_offset_s,
-        solution.covariance + np.outer(step, step),
-        tuple(frame.id for frame in solution.frames),
+        cTl=at.cTl,
+        time_offset_s=at.time_offset_s,
+        covariance=solution.covariance + np.outer(step, step),
+        frames=tuple(frame.id for frame in solution.frames),
         reasons=(*second.reasons, *_unfinished(solution, config)),
         remarks=solution.reasons,
         diagnostics={

@@ -230,27 +230,28 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
     solution, unknowns = motion.estimate.solution, total.unknowns
     wrong = joint_reasons(problem, solution, solutions, unknowns, agreement)
     return MethodEstimate(
-        solution.state.cTl,
-        solution.state.time_offsets_s[0],
-        total.covariance,
-        frames_used(drives, solution),
-        (*_contradicted(tests, contradictions, wrong), *motion.reasons),
-        (*motion.remarks, *total.remarks),
-        assumed_motion(drives),
-        motion.estimate.by_static_objects[:7, :7],
-        drive_offsets(drives, solution.state, unknowns),
-        total.by_drive,
-        agreement
-        | {"start_score": start.score, "contradictions": contradictions.diagnostics}
-        | {
+        cTl=solution.state.cTl,
+        time_offset_s=solution.state.time_offsets_s[0],
+        covariance=total.covariance,
+        frames=frames_used(drives, solution),
+        reasons=(*_contradicted(tests, contradictions, wrong), *motion.reasons),
+        remarks=(*motion.remarks, *total.remarks),
+        assumed=assumed_motion(drives),
+        by_static_objects=motion.estimate.by_static_objects[:7, :7],
+        drive_offsets=drive_offsets(drives, solution.state, unknowns),
+        by_drive=total.by_drive,
+        diagnostics={
+            **agreement,
+            "start_score": start.score,
+            "contradictions": contradictions.diagnostics,
             "motion": motion.diagnostics,
             "assumptions": assumption_report(considered, tests),
             "image_shift_px": total.shifts.sigmas_px.round(3).tolist(),
             BUDGET: total.budget,
-        }
-        | joint_diagnostics(problem, motion.estimate, lower),
-        JointOutcome(motion.estimate, considered),
-        fit,
+            **joint_diagnostics(problem, motion.estimate, lower),
+        },
+        solved=JointOutcome(motion.estimate, considered),
+        fit=fit,
         matched=MatchedDrives(problem, solution.state),
         by_sweeps=total.by_sweeps,
         open_sweeps=total.reasons,

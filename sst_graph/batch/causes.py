@@ -22,7 +22,7 @@ from sst_graph.diagnosis import (
 )
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
-from sst_graph.graph.matching import Tracks
+from sst_graph.graph.drive_motion import motions_of
 from sst_graph.graph.outer_loop import (
     NARROW_KERNELS_PX,
     JointProblem,
@@ -120,17 +120,17 @@ def fit_labels(config: CalibrationConfig) -> Fitter:
 
     def fit(drive: Drive, guess: Guess) -> Fit | None:
         step = -(-len(drive.scans) // _SCANS)
-        tracks = Tracks([drive])
+        motions = motions_of([drive])
         few = [replace(drive, scans=drive.scans[::step])]
         joint = replace(config.joint, max_outer=len(NARROW_KERNELS_PX))
-        search = StartProblem(few, tracks, config.classes, guess)
+        search = StartProblem(few, motions, config.classes, guess)
         try:
             selection = run_to_end(
                 select_start_steps(search, joint.graph, config.search, _SCANS, _CANDIDATES)
             )
             cTl, found_s = selection.starts[0]
             start = State(cTl, (found_s,))
-            problem = JointProblem(few, tracks, joint, prior_centre(guess, start))
+            problem = JointProblem(few, motions, joint, prior_centre(guess, start))
             solution = solve_joint(problem, start, NARROW_KERNELS_PX)
         except EstimationError:
             return None

@@ -224,13 +224,13 @@ def _between(parts: PartSolver, stretches: Sequence[Sequence[SolvedPart]]) -> di
         if part is not None:
             solved[number] = part.step
     own_offsets = len(parts.reference.time_offsets_s) > 1
-    judged = {2: [*solved][1:]}.get(len(solved), [*solved])  # of two, either contradicts the other
+    # Of two, the second stands for both.
+    compared = [*solved][1:] if len(solved) <= 2 else [*solved]
     return {
         number: Difference.of(
             combined([solved[k] for k in solved if k != number]), solved[number], own_offsets
         )
-        for number in judged
-        if len(solved) > 1
+        for number in compared
     }
 
 

@@ -11,9 +11,15 @@ from sst_graph.batch.assumption_tests import estimated_report
 from sst_graph.batch.lower_edges import WithLowerEdges
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.drive.preparation import Drive
-from sst_graph.errors import count_of
 from sst_graph.fit import Fit, Profile
-from sst_graph.graph.outer_loop import JointSolution, agreement, concentration, explained, poor_fit
+from sst_graph.graph.outer_loop import (
+    JointSolution,
+    agreement,
+    concentration,
+    explained,
+    poor_fit,
+    still_moved,
+)
 from sst_graph.graph.state import difference
 from sst_graph.initialization.selection import ALTERNATIVE_RATIO, REACH
 from sst_graph.inspect.frame_gains import frame_gains
@@ -109,7 +115,7 @@ def fit_of(
 
 def _moving(solution: JointSolution) -> Iterator[str]:
     if not solution.converged:
-        yield f"the outer loop still moved after {count_of(solution.outer_iterations, 'iteration')}"
+        yield still_moved(solution.outer_iterations)
 
 
 def _little_agreement(

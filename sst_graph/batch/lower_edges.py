@@ -15,7 +15,8 @@ from sst_graph.association.edge_matching import BOTTOM
 from sst_graph.batch.config import UseLowerEdges
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.factors.robust import RobustKernel
-from sst_graph.graph.matching import Tracks, edges_of, match_all
+from sst_graph.graph.drive_motion import DriveMotion
+from sst_graph.graph.matching import edges_of, match_all
 from sst_graph.graph.outer_loop import (
     CONCENTRATION_SCALES,
     KERNELS_PX,
@@ -70,7 +71,7 @@ def with_lower_edges(
     solutions, joint = [solution for solution, _ in finals], problem.config
     if use == "never":
         return WithLowerEdges(solutions, joint)
-    support = lower_edge_support(problem.drives, problem.tracks, solutions[0].state, joint)
+    support = lower_edge_support(problem.drives, problem.motions, solutions[0].state, joint)
     chosen, concentration = support.agreed(use)
     if not chosen:
         return WithLowerEdges(solutions, joint, concentration)
@@ -114,12 +115,12 @@ def _summed(a: Mapping[SemanticClass, float], b: Mapping[SemanticClass, float]) 
 
 
 def lower_edge_support(
-    drives: Sequence[Drive], tracks: Tracks, state: State, joint: JointConfig
+    drives: Sequence[Drive], motions: Sequence[DriveMotion], state: State, joint: JointConfig
 ) -> LowerEdgeSupport:
     """Support of the lower edges of some scans at a state."""
     classes = {c for drive in drives for scan in drive.scans for c in scan.lower_edges}
     graph = replace(joint.graph, lower_edges=tuple(sorted(classes)))
-    edges = edges_of(drives, tracks, graph)
+    edges = edges_of(drives, motions, graph)
     narrow, wide = (
         support_of(
             match_all(edges, state, RobustKernel("geman_mcclure", scale * KERNELS_PX[-1])),

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 UNKNOWN_SIGMAS = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
 """(7,) deviations of what is not known at all [rad, m, s]."""
 PACKAGES = ("sst-graph", "gtsam", "numpy", "scipy", "small_gicp")
+"""Distributions whose versions a result names."""
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from sst_graph.batch.by_edges.problem import problem_of_some_frames, with_fewer_
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import MethodEstimate
 from sst_graph.drive.preparation import Drive, Progress
-from sst_graph.errors import count_of
 from sst_graph.fit import Fit
+from sst_graph.graph.outer_loop import still_moved
 from sst_graph.graph.state import difference
 from sst_graph.hand_eye.solution import MotionSolution, alternative, solve_motion
 from sst_graph.inspect.gained import KEY, pair_gains, to_document
@@ -35,10 +35,10 @@ def motion_method(
     frames = tuple(FrameId(drives[camera.drive].name, camera.image) for camera in cameras)
     gained = pair_gains(best.terms.each(), frames, best.state)
     return MethodEstimate(
-        best.state.cTl,
-        best.state.time_offsets_s[0],
-        best.covariance,
-        frames,
+        cTl=best.state.cTl,
+        time_offset_s=best.state.time_offsets_s[0],
+        covariance=best.covariance,
+        frames=frames,
         reasons=_reasons(solutions),
         diagnostics={
             "outer_iterations": best.outer_iterations,
@@ -75,7 +75,7 @@ def _reasons(solutions: Sequence[MotionSolution]) -> tuple[str, ...]:
     best = solutions[0]
     reasons = []
     if not best.converged:
-        reasons.append(f"the outer loop still moved after {count_of(best.outer_iterations, 'iteration')}")
+        reasons.append(still_moved(best.outer_iterations))
     if best.misfit is not None:
         reasons.append(best.misfit)
     other = alternative(solutions)

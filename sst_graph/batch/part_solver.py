@@ -12,7 +12,8 @@ from sst_graph.covariance.contradiction import PartEstimate
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
 from sst_graph.factors.robust import RobustKernel
-from sst_graph.graph.matching import Tracks, edges_of, match_all
+from sst_graph.graph.drive_motion import DriveMotion
+from sst_graph.graph.matching import edges_of, match_all
 from sst_graph.graph.outer_loop import JointProblem, JointSolution, robust_weights, solve_joint
 from sst_graph.graph.state import State, difference
 from sst_graph.objects.tracks import tracks_of_scans
@@ -106,9 +107,9 @@ class PartSolver:
 
     def _solved(self, part: Part, start: State, kernels_px: tuple[float, ...]) -> SolvedPart | None:
         joint = replace(self.problem.config.joint, max_outer=len(kernels_px) + _MOST_AT_LAST_SCALE)
-        drive, tracks = self._data(part)
+        drive, motion = self._data(part)
         try:
-            problem = JointProblem([drive], tracks, joint, self.reference_of(part))
+            problem = JointProblem([drive], [motion], joint, self.reference_of(part))
             solution = solve_joint(problem, start, kernels_px)
             return SolvedPart(part, solution.state, self._step(part, solution))
         except (EstimationError, np.linalg.LinAlgError):
@@ -127,17 +128,17 @@ class PartSolver:
         step = difference(self.reference_of(part), solution.state)
         return PartEstimate(step, covariance, estimate.robust.table.clusters, considered.steps())
 
-    def _data(self, part: Part) -> tuple[Drive, Tracks]:
-        """The drive and its tracks, of the part's scans alone."""
-        drive, tracks = self.drives[part.drive], self.problem.tracks
-        return drive.part(part.scans), tracks.part(part.drive, part.scans)
+    def _data(self, part: Part) -> tuple[Drive, DriveMotion]:
+        """The drive and its motion, of the part's scans alone."""
+        drive, motion = self.drives[part.drive], self.problem.motions[part.drive]
+        return drive.part(part.scans), motion.part(part.scans)
 
     def support(self, part: Part, state: State) -> FloatArray:
         """(scans,) how much each scan of a part agrees with a state: matches, counted by robust weight."""
-        drive, tracks = self._data(part)
+        drive, motion = self._data(part)
         kernel = RobustKernel("geman_mcclure", self.kernels_px[-1])
         found = np.zeros(len(part.scans))
-        for own in match_all(edges_of([drive], tracks, self.problem.config.noise), state, kernel):
+        for own in match_all(edges_of([drive], [motion], self.problem.config.noise), state, kernel):
             scans = np.array([pair.scan for pair in own.pairs])[own.pair_of]
             found += np.bincount(scans, robust_weights(own, state), len(found))
         return found

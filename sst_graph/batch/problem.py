@@ -15,7 +15,7 @@ from sst_graph.covariance.considered import AssumptionConfig, Considered, consid
 from sst_graph.covariance.static_objects import static_covariance
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.fit import Fit, OuterIteration, Profile
-from sst_graph.graph.matching import Tracks
+from sst_graph.graph.drive_motion import DriveMotion, motions_of
 from sst_graph.graph.outer_loop import (
     KERNELS_PX,
     NARROW_KERNELS_PX,
@@ -38,15 +38,15 @@ class CalibrationProblem:
 
     Attributes:
         drives: what is kept of them.
-        tracks: twist tracks; object tracks, too, where objects have mask biases.
-        objects: object tracks of each drive.
+        motions: of each drive: its LiDAR's, and its objects' where those have mask biases.
+        objects: tracks of the objects of each drive.
         guess: what is known beforehand.
         config: settings, the estimated parameters among those of the graph.
         progress: called with (stage, steps done, steps in all).
     """
 
     drives: Sequence[Drive]
-    tracks: Tracks
+    motions: Sequence[DriveMotion]
     objects: Sequence[dict[ObjectId, int]]
     guess: Guess
     config: CalibrationConfig
@@ -65,8 +65,8 @@ class CalibrationProblem:
         config = replace(config, noise=replace(config.noise, every_image=True))
         objects = [object_tracks(drive) for drive in drives]
         by_object = config.noise.object_bias_sigma_px > 0.0
-        tracks = Tracks(drives, objects if by_object else None)
-        return cls(drives, tracks, objects, guess, config, progress)
+        motions = motions_of(drives, objects if by_object else None)
+        return cls(drives, motions, objects, guess, config, progress)
 
     def prior_centre(self, state: State) -> State:
         """What the weak priors of a solution from or at a state are centred on."""
@@ -83,7 +83,7 @@ class CalibrationProblem:
     def fit_of_drives(self) -> FitOfDrives:
         """What measures how states fit the drives: their labels, or edges of their pictures."""
         graph = self.config.joint.graph
-        return FitOfDrives(self.drives, self.tracks, self.objects, graph, self.config.seed)
+        return FitOfDrives(self.drives, self.motions, self.objects, graph, self.config.seed)
 
     def fit_at(
         self, state: State, iterations: Sequence[OuterIteration] = (), profiles: Sequence[Profile] = ()
@@ -98,7 +98,7 @@ class CalibrationProblem:
 
     def joint(self) -> JointProblem:
         """The graph's part of the problem."""
-        return JointProblem(self.drives, self.tracks, self.config.joint)
+        return JointProblem(self.drives, self.motions, self.config.joint)
 
     def start(self) -> Selection:
         """The best starts of a global search around the guess, compared on a few scans.
@@ -106,8 +106,8 @@ class CalibrationProblem:
         Raises:
             EstimationError: no candidate leads anywhere.
         """
-        # Without the tracks of objects.
-        problem = StartProblem(self.drives, Tracks(self.drives), self.config.classes, self.guess)
+        # Objects have no bias of their own yet.
+        problem = StartProblem(self.drives, motions_of(self.drives), self.config.classes, self.guess)
         return run_to_end(select_start_steps(problem, self.config.noise, self.config.search))
 
     def with_lower_edges(self, solutions: Sequence[JointSolution]) -> WithLowerEdges:

@@ -29,8 +29,10 @@ disturbs all other estimates a little (odometry, dynamic objects)."""
 _ONE_AXIS = 0.9
 """A step along one axis to this share (cosine) is named by that axis alone."""
 _KINDS = {"rotation": slice(0, 3), "translation": slice(3, 6), "offset": slice(6, 7)}
+"""Kinds of a step, and where its numbers stand."""
 _TURNS = ("pitch", "yaw", "roll")
 _WAYS = (("left", "right"), ("up", "down"), ("backward", "forward"))
+"""What a turn about each of the camera's axes, and a shift against or along it, is called."""
 
 
 @dataclass(frozen=True)

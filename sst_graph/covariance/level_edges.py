@@ -28,6 +28,7 @@ MOMENTS = 12
 """Sums over the frames of a side: of weights w, of w^2, of w s^2, of w p (3) and of the upper triangle of
 w p p' (6), p the mean place of its matches."""
 _UPPER = np.triu_indices(3)
+"""Places of the upper triangle in p p'."""
 _RIDGE_M2 = 1e-6
 """Added to how far the places of edges vary, where they hardly do: 1 mm of one edge."""
 

@@ -122,7 +122,8 @@ def match_table(
             curvatures.append(curvatures_of(matches.alignment.kernel, root, r))
             level.append(LevelEdges.of(matches.alignment, matches.level_px, pair.wTl))
             track = np.array([tracks[pair.drive][pair.pair.scan, c, int(o)] for o in matches.objects])
-            sides.append((track * _MOST_DRIVES + pair.drive) * SIDES + matches.sides)
+            # Tracks of different drives have numbers of their own.
+            sides.append((track * len(tracks) + pair.drive) * SIDES + matches.sides)
     # What several images show of one scan errs together: its points are the same.
     scans: dict[tuple[int, int], int] = {}
     frames = [scans.setdefault((pair.drive, pair.pair.scan), len(scans)) for pair in pairs]
@@ -135,10 +136,6 @@ def match_table(
         np.repeat(frames, [len(pair) for pair in pairs]),
         LevelEdges.joined(level),
     )
-
-
-_MOST_DRIVES = 64
-"""Tracks of different drives have different numbers: those of a drive are this far apart."""
 
 
 @dataclass(frozen=True)

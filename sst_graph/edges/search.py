@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from sst_graph.edges.agreement import BlurredScore
 from sst_graph.graph.matching import DriveEdges
 from sst_graph.graph.state import State
-from sst_graph.metrics import quaternion_angle_deg
+from sst_graph.metrics import turn_rad
 from sst_graph.stepwise import Stepwise
 from sst_graph.types import FloatArray
 
@@ -130,13 +130,8 @@ def _scored(
 
 
 def _apart(a: State, b: State) -> bool:
-    far = angle_deg(a.cTl, b.cTl) > APART_DEG
+    far = float(np.degrees(turn_rad(a.cTl, b.cTl))) > APART_DEG
     return far or abs(a.time_offsets_s[0] - b.time_offsets_s[0]) > APART_S
-
-
-def angle_deg(a: gtsam.Pose3, b: gtsam.Pose3) -> float:
-    """Angle between two rotations [deg]."""
-    return quaternion_angle_deg(a.rotation(), b.rotation())
 
 
 def turned(cTl: gtsam.Pose3, turns_rad: FloatArray) -> FloatArray:

@@ -17,7 +17,7 @@ from sst_graph.drive.twists import camera_twist
 from sst_graph.errors import ConfigError
 from sst_graph.experiments.markdown import median, table
 from sst_graph.experiments.starts import start_near, truth_of
-from sst_graph.graph.matching import Tracks
+from sst_graph.graph.drive_motion import DriveMotion
 from sst_graph.metrics import CalibrationErrors, calibration_errors
 from sst_graph.result import CalibrationResult
 from sst_graph.types import GroundTruth, Source
@@ -108,8 +108,8 @@ def _spread_deg(results: Sequence[CalibrationResult]) -> float:
 
 def _along(result: CalibrationResult, errors: CalibrationErrors, truth: GroundTruth, drive: Drive) -> float:
     """Error of what a steady drive determines along the road: forward - speed x time offset [m]."""
-    tracks = Tracks([drive])
-    samples = [tracks.at(0, scan.stamp_ns) for scan in drive.scans]
+    motion = DriveMotion.of(drive)
+    samples = [motion.at(scan.stamp_ns) for scan in drive.scans]
     forward = [camera_twist(sample, truth.cTl).twist[5] for sample in samples if sample is not None]
     speed = float(np.mean(forward)) if forward else 0.0
     shift = result.T_camera_lidar.translation() - truth.cTl.translation()

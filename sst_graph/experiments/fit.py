@@ -82,7 +82,7 @@ def _row(config: FitTableConfig, seed: int, noise: float) -> list[str]:
     offset_s = truth.time_offset_s or 0.0
     problem = CalibrationProblem.of(drives, Guess(truth.cTl, offset_s), config.calibration)
     state = _solved(problem, State(truth.cTl, (offset_s,)))
-    fit = FitOfDrives(problem.drives, problem.tracks, problem.objects, problem.config.joint.graph)
+    fit = FitOfDrives(problem.drives, problem.motions, problem.objects, problem.config.joint.graph)
 
     def quality(at: State) -> FitQuality:
         measured = fit.measured(at)

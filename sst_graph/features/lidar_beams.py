@@ -19,8 +19,11 @@ from numpy.typing import NDArray
 from sst_graph.types import FloatArray, IntArray
 
 _CONE_NOISE_M = 0.02
+"""Distance from its cone at which a point has a quarter of its weight [m]: the range noise of an HDL-64E."""
 _ROUNDS = 6
+"""Rounds of the robust regression."""
 _MIN_CONE_POINTS = 30
+"""Fewest points of a ring whose cone is fitted."""
 _CONE_POINTS = 256
 """Points of a ring that its cone is fitted to."""
 _STEPS = 8_000

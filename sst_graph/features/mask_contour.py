@@ -9,18 +9,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.features.image_edges import Picture, PictureEdges, find_picture_edges
+from sst_graph.features.image_edges import FloatMap, Picture, PictureEdges, find_picture_edges
 from sst_graph.features.sampling import sampled
 from sst_graph.files.array_store import ArrayStore, shape_of, storable
 from sst_graph.types import FloatArray, IntArray, PixelStretch, SemanticClass
 
-FloatMap = NDArray[np.float32]
-
 _SMOOTHING_PX = 1.0
+"""Gaussian smoothing of the distances [px]: a mask's contour is a staircase of pixels."""
 BORDER_PX = 3.0
 """Nothing is matched this close to the image's border [px]: objects are cut there."""
 REACH_PX = 64
-"""The field ends this far around the class [px]: beyond every gate (``gate`` times the widest kernel)."""
+"""The field ends this far around the class [px]: beyond the farthest match, three times the widest kernel."""
 MIN_GRADIENT = 0.3
 """A distance field whose gradient is shorter than this has no clear nearest contour (a ridge)."""
 _CROSS = np.array([[0.0, 1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0, -1.0]])[:, None, :]

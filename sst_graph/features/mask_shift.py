@@ -19,6 +19,7 @@ from sst_graph.types import FloatArray, SemanticClass
 REACH_PX = 10
 """Farthest shift that is tried, either way [px]."""
 SIDE = 2 * REACH_PX + 1
+"""Shifts that are tried along each axis."""
 _MARGIN_PX = REACH_PX + 2
 """Contour pixels this close to the image's border or to pixels to ignore are left out [px]."""
 _AROUND_PX = 16
@@ -27,11 +28,13 @@ filters' widths [px]."""
 _LEAST_PIXELS = 60
 """Contour pixels of an object that takes part."""
 _MOST_PIXELS = 400
+"""Most that are looked at: neighbours show the same."""
 _COLUMNS = 8
 """Objects in one such part of the image's width form a cluster: over a drive they are the same ones."""
 _APART_PX = 4.0
 """Shifts farther apart than this see different edges [px]."""
 _LEAST_OBJECTS, _LEAST_CLUSTERS = 8, 3
+"""Fewest objects, and clusters of them, that a shift and its uncertainty are told from."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +81,7 @@ class MaskShift:
 
     @property
     def length_px(self) -> float:
+        """How far the masks are shifted [px]."""
         return float(np.hypot(self.right_px, self.down_px))
 
     @property

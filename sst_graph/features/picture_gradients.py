@@ -15,13 +15,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.features.image_edges import Picture
+from sst_graph.features.image_edges import FloatMap, Picture
 from sst_graph.features.mask_contour import ContourFeet, well_inside
 from sst_graph.features.sampling import sampled
 from sst_graph.files.array_store import ArrayStore, shape_of, storable
 from sst_graph.types import FloatArray
-
-FloatMap = NDArray[np.float32]
 
 EdgePlace = Literal["centre", "peak", "strongest"]
 """What a point is compared with: the centre of mass of the strengths nearby, their peak by a step of Newton's

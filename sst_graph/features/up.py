@@ -12,6 +12,7 @@ from sst_graph.features.ground import fitted_plane, lowest_of_cells
 from sst_graph.types import FloatArray
 
 LEVEL = np.array([0.0, 0.0, 1.0])
+"""Up where the sensor is level."""
 _MOST_POINTS = 8_000
 """Points that are looked at, about."""
 _BAND_M = 0.3

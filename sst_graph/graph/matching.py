@@ -31,24 +31,18 @@ from sst_graph.assumptions import named_sigmas
 from sst_graph.assumptions.model import Scene
 from sst_graph.config import internal, setting
 from sst_graph.drive.preparation import Drive, boundaries_of
-from sst_graph.drive.twists import GrowingTwists, SensorTwists, TwistSample, TwistSamples
+from sst_graph.drive.twists import TwistSample, TwistSamples
 from sst_graph.errors import ConfigError
 from sst_graph.factors.matches import Alignment
 from sst_graph.factors.motion import CameraTwist
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.features.lidar_edges import Boundaries, joined
+from sst_graph.graph.drive_motion import DriveMotion, DynamicObjects
 from sst_graph.graph.nuisances import deviation_of, moved_twists, residual_columns
 from sst_graph.graph.state import State, lower_edge_track
-from sst_graph.objects.dynamic_objects import (
-    DynamicObject,
-    dynamic_object_weights,
-    find_dynamic_objects,
-)
-from sst_graph.objects.tracks import ObjectId, numbers_in, of_each, scan_poses, tracks_of_scans
+from sst_graph.objects.dynamic_objects import dynamic_object_weights
+from sst_graph.objects.tracks import numbers_in, of_each
 from sst_graph.types import FloatArray, IntArray, SemanticClass
-
-DynamicObjects = dict[tuple[SemanticClass, int], DynamicObject]
-"""The dynamic objects of one scan, by class and number within the scan."""
 
 
 @dataclass(frozen=True)
@@ -144,89 +138,14 @@ class PairMatches:
         return found
 
 
-class Tracks:
-    """Twists and poses of the LiDAR over time in all drives, and tracks of their objects where those are
-    given."""
-
-    def __init__(
-        self,
-        drives: Sequence[Drive],
-        objects: Sequence[Mapping[ObjectId, int]] | None = None,
-        growing: GrowingTwists | None = None,
-    ) -> None:
-        """growing: of a single drive whose motions grow; its poses are not known."""
-        # Smoothed, exactly zero at standstill; None for a single scan.
-        self._twists: list[SensorTwists | None] = [
-            (growing or GrowingTwists()).of(drive.lidar_motions) for drive in drives
-        ]
-        self._poses: list[Sequence[gtsam.Pose3 | None]] = [
-            scan_poses(drive) if growing is None else () for drive in drives
-        ]
-        self.objects: Sequence[Mapping[ObjectId, int]] | None = objects
-        found = zip(drives, objects, strict=True) if objects is not None else ()
-        self._dynamic = [_by_scan(find_dynamic_objects(drive, tracks)) for drive, tracks in found]
-
-    def with_objects(
-        self,
-        objects: Mapping[ObjectId, int],
-        dynamic: Mapping[ObjectId, DynamicObject],
-        poses: Sequence[gtsam.Pose3] = (),
-    ) -> Tracks:
-        """The same twists of one drive, with other object tracks, dynamic objects, and poses of its scans."""
-        other = Tracks([])
-        other._twists, other.objects, other._dynamic = self._twists, [objects], [_by_scan(dynamic)]
-        other._poses = [poses]
-        return other
-
-    def part(self, drive: int, scans: Sequence[int]) -> Tracks:
-        """The tracks of some scans of one drive (:meth:`Drive.part`), which becomes drive 0."""
-        other, place = Tracks([]), {position: k for k, position in enumerate(scans)}
-        other._twists = [self._twists[drive]]
-        other._poses = [[self.pose(drive, k) for k in scans]]
-        if self.objects is not None:
-            other.objects = [tracks_of_scans(self.objects[drive], scans)]
-            moving = self._dynamic[drive]
-            other._dynamic = [{place[scan]: own for scan, own in moving.items() if scan in place}]
-        return other
-
-    @classmethod
-    def joined(cls, parts: Sequence[Tracks]) -> Tracks:
-        """The tracks of several drives, each given by itself."""
-        other = cls([])
-        other._twists = [twists for part in parts for twists in part._twists]
-        other._poses = [poses for part in parts for poses in part._poses]
-        if all(part.objects is not None for part in parts):
-            other.objects = [own for part in parts for own in part.objects or ()]
-            other._dynamic = [own for part in parts for own in part._dynamic]
-        return other
-
-    def dynamic_objects(self, drive: int, scan: int) -> DynamicObjects:
-        """The dynamic objects of a scan."""
-        return self._dynamic[drive].get(scan, {}) if self._dynamic else {}
-
-    def pose(self, drive: int, scan: int) -> gtsam.Pose3 | None:
-        """Pose of a scan in the world, by its position; None where it is not known."""
-        poses = self._poses[drive]
-        return poses[scan] if scan < len(poses) else None
-
-    def at(self, drive: int, stamp_ns: int) -> TwistSample | None:
-        """The LiDAR's twist at a stamp of its clock, or None without odometry."""
-        twists = self._twists[drive]
-        return None if twists is None else twists.at(stamp_ns)
-
-    def at_all(self, drive: int, stamps_ns: Sequence[int]) -> TwistSamples | None:
-        """The LiDAR's twists at stamps of its clock, or None without odometry."""
-        twists = self._twists[drive]
-        return None if twists is None else twists.at_all(stamps_ns)
-
-
 @dataclass(frozen=True)
 class DriveEdges:
     """The boundary points of a drive, group by group: what one scan shows of one class.
 
     Attributes:
         number: of the drive.
-        drive, tracks: where they come from.
+        drive: where they come from.
+        motion: of its LiDAR and of its objects.
         config: which of them, and how they are matched.
         scans, classes: scan and class of each group, the scans rising.
         points, owners, bounds: as in :class:`~sst_graph.association.edge_matching.PairedEdges`.
@@ -238,7 +157,7 @@ class DriveEdges:
 
     number: int
     drive: Drive
-    tracks: Tracks
+    motion: DriveMotion
     config: GraphConfig
     scans: tuple[int, ...]
     classes: tuple[SemanticClass, ...]
@@ -250,7 +169,7 @@ class DriveEdges:
     velocities: FloatArray | None
 
     @classmethod
-    def of(cls, number: int, drive: Drive, tracks: Tracks, config: GraphConfig) -> DriveEdges | None:
+    def of(cls, number: int, drive: Drive, motion: DriveMotion, config: GraphConfig) -> DriveEdges | None:
         """All of a drive; None where it has no boundary point."""
         groups = [
             (k, c, points)
@@ -262,21 +181,18 @@ class DriveEdges:
             return None
         parts = [points for _, _, points in groups]
         own = None
-        if tracks.objects is not None:
-            known = tracks.objects[number]
+        if (known := motion.objects) is not None:
             own = np.concatenate(
                 [
                     of_each(points.objects, {n: known[k, c, n] for n in numbers_in(points.objects)})
                     for k, c, points in groups
                 ]
             )
-        unknown_mps, velocities = _own_motion(
-            [(tracks.dynamic_objects(number, k), c, b) for k, c, b in groups]
-        )
+        unknown_mps, velocities = _own_motion([(motion.dynamic_objects(k), c, b) for k, c, b in groups])
         return cls(
             number,
             drive,
-            tracks,
+            motion,
             config,
             tuple(k for k, _, _ in groups),
             tuple(c for _, c, _ in groups),
@@ -436,7 +352,7 @@ class _Motions:
         shift_ns = round(state.time_offset_s(number) * 1e9)
         origin_ns = drive.images[0].stamp_ns if drive.origin_ns is None else drive.origin_ns
         since_s = np.array([stamp - origin_ns for stamp in stamps]) * 1e-9
-        l_twists = edges.tracks.at_all(number, [stamp + shift_ns for stamp in stamps])
+        l_twists = edges.motion.at_all([stamp + shift_ns for stamp in stamps])
         if l_twists is None:
             rest = np.zeros((len(pairs), 6))
             return cls(rest, rest, None, rest, since_s)
@@ -625,7 +541,7 @@ class DriveMatches:
                 for c, (own, _) in groups.items()
                 if self.terms
             },
-            self.edges.tracks.pose(self.number, self.pairs[p].scan),
+            self.edges.motion.pose(self.pairs[p].scan),
         )
 
     def _alignment_of(self, own: slice, motion: CameraTwist) -> Alignment:
@@ -652,9 +568,14 @@ def _own_motion(
     return slow if slow.any() else None, known if known.any() else None
 
 
-def edges_of(drives: Sequence[Drive], tracks: Tracks, config: GraphConfig) -> list[DriveEdges]:
+def edges_of(
+    drives: Sequence[Drive], motions: Sequence[DriveMotion], config: GraphConfig
+) -> list[DriveEdges]:
     """The boundary points of drives, to be matched again and again; drives without any are left out."""
-    found = [DriveEdges.of(number, drive, tracks, config) for number, drive in enumerate(drives)]
+    found = [
+        DriveEdges.of(number, drive, motion, config)
+        for number, (drive, motion) in enumerate(zip(drives, motions, strict=True))
+    ]
     return [edges for edges in found if edges is not None]
 
 
@@ -665,15 +586,12 @@ def match_all(edges: Sequence[DriveEdges], state: State, kernel: RobustKernel) -
 
 
 def associate(
-    drives: Sequence[Drive], tracks: Tracks, state: State, kernel: RobustKernel, config: GraphConfig
+    drives: Sequence[Drive],
+    motions: Sequence[DriveMotion],
+    state: State,
+    kernel: RobustKernel,
+    config: GraphConfig,
 ) -> list[PairMatches]:
     """Pair scans with images in true time under a state, and match their silhouettes."""
-    found = match_all(edges_of(drives, tracks, config), state, kernel)
+    found = match_all(edges_of(drives, motions, config), state, kernel)
     return [pair for matches in found for pair in matches.by_pair()]
-
-
-def _by_scan(dynamic: Mapping[ObjectId, DynamicObject]) -> dict[int, DynamicObjects]:
-    found: dict[int, DynamicObjects] = {}
-    for (scan, c, n), one in dynamic.items():
-        found.setdefault(scan, {})[c, n] = one
-    return found

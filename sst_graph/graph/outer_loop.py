@@ -24,6 +24,7 @@ from sst_graph.factors import residuals
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.fit import OuterIteration
 from sst_graph.graph.building import joint_graph
+from sst_graph.graph.drive_motion import DriveMotion, motions_of
 from sst_graph.graph.frozen_problem import FrozenPoint, FrozenProblem
 from sst_graph.graph.known import KnownCalibration
 from sst_graph.graph.matching import (
@@ -31,7 +32,6 @@ from sst_graph.graph.matching import (
     DriveMatches,
     GraphConfig,
     PairMatches,
-    Tracks,
     edges_of,
     match_all,
 )
@@ -105,23 +105,24 @@ class JointProblem:
 
     Attributes:
         drives: all of them.
-        tracks: their twists, and their objects where those have mask biases.
+        motions: of each: its LiDAR's, and its objects' where those have mask biases.
         config: matches, priors, limits.
         centre: what the weak priors are centred on; the start where it is None.
         prior: what is known beside the matches.
     """
 
     drives: Sequence[Drive]
-    tracks: Tracks
+    motions: Sequence[DriveMotion]
     config: JointConfig
     centre: State | None = None
     prior: KnownCalibration | None = None
 
     @classmethod
     def of(cls, drives: Sequence[Drive], config: JointConfig) -> JointProblem:
-        """With the tracks that the configuration needs."""
+        """With the objects tracked where the configuration has biases of theirs."""
         by_object = config.graph.object_bias_sigma_px > 0.0
-        return cls(drives, Tracks(drives, [object_tracks(d) for d in drives] if by_object else None), config)
+        objects = [object_tracks(drive) for drive in drives] if by_object else None
+        return cls(drives, motions_of(drives, objects), config)
 
     def estimating(self, names: Sequence[str]) -> JointProblem:
         """The problem with the parameters of further assumptions as variables, their spans as priors."""
@@ -214,7 +215,7 @@ def solve_joint_steps(
     """
     config, state, converged, outer = problem.config, start, False, 0
     centre = start if problem.centre is None else problem.centre
-    edges = edges_of(problem.drives, problem.tracks, config.graph)
+    edges = edges_of(problem.drives, problem.motions, config.graph)
     iterations = []
     for outer in range(config.max_outer):
         # 1. Matches at the current estimate, under a kernel that narrows.
@@ -310,7 +311,7 @@ def concentration(solution: JointSolution, problem: JointProblem) -> float:
     """
     kernel = RobustKernel("geman_mcclure", CONCENTRATION_SCALES[1] * KERNELS_PX[-1])
     matches = match_all(
-        edges_of(problem.drives, problem.tracks, problem.config.graph), solution.state, kernel
+        edges_of(problem.drives, problem.motions, problem.config.graph), solution.state, kernel
     )
     return support(solution) / max(_support(matches, solution.state), 1e-9)
 
@@ -326,6 +327,11 @@ def agreement(solution: JointSolution) -> float:
     The support alone would prefer poses that bring many objects into view.
     """
     return support(solution) ** 2 / _seen(solution)
+
+
+def still_moved(outer_iterations: int) -> str:
+    """Why a solution that did not converge may be wrong."""
+    return f"the outer loop still moved after {count_of(outer_iterations, 'iteration')}"
 
 
 def poor_fit(explained: float, concentration: float, rotation_observable: bool) -> list[str]:

@@ -16,6 +16,8 @@ EXTRINSIC = gtsam.symbol("E", 0)
 """Key of the extrinsic cTl (Pose3)."""
 
 _IMAGES_PER_DRIVE = 10_000_000
+"""Keys of the images of two drives, and of their objects, are this far apart; a key has 56 bits for them."""
+_Key = TypeVar("_Key")
 
 
 def time_offset_key(clock: int = 0) -> int:
@@ -41,9 +43,6 @@ def lower_edge_track(semantic_class: SemanticClass) -> int:
 def object_bias_key(drive: int, track: int) -> int:
     """Key of the mask bias of one object, by its track (``Vector(1)``, px)."""
     return int(gtsam.symbol("O", drive * _IMAGES_PER_DRIVE + track))
-
-
-_Key = TypeVar("_Key")
 
 
 def nuisance_key(name: str) -> int:
@@ -104,9 +103,9 @@ class State:
             tuple(
                 a + share * (b - a) for a, b in zip(self.time_offsets_s, other.time_offsets_s, strict=True)
             ),
-            _between(self.biases_px, other.biases_px, share),
-            _between(self.object_biases_px, other.object_biases_px, share),
-            _between(self.nuisances, other.nuisances, share),
+            _interpolated(self.biases_px, other.biases_px, share),
+            _interpolated(self.object_biases_px, other.object_biases_px, share),
+            _interpolated(self.nuisances, other.nuisances, share),
         )
 
 
@@ -116,5 +115,12 @@ def difference(a: State, b: State) -> FloatArray:
     return np.append(gtsam.Pose3.Logmap(a.cTl.between(b.cTl)), b.time_offsets_s[0] - a.time_offsets_s[0])
 
 
-def _between(mine: Mapping[_Key, float], its: Mapping[_Key, float], share: float) -> dict[_Key, float]:
-    return {key: (1.0 - share) * mine.get(key, value) + share * value for key, value in its.items()}
+def step_text(step: FloatArray) -> str:
+    """A step (7,) [rad, m, s] in a sentence: "0.10 deg, 1.2 cm and +3.4 ms"."""
+    rotation, translation = np.linalg.norm(step[:3]), np.linalg.norm(step[3:6])
+    return f"{np.degrees(rotation):.2f} deg, {100.0 * translation:.1f} cm and {1e3 * step[6]:+.1f} ms"
+
+
+def _interpolated(a: Mapping[_Key, float], b: Mapping[_Key, float], share: float) -> dict[_Key, float]:
+    """From a (share 0) to b (1); what a does not have is as in b."""
+    return {key: (1.0 - share) * a.get(key, value) + share * value for key, value in b.items()}

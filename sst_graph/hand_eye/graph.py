@@ -150,8 +150,8 @@ class HandEyeTerms:
         pairs: the motions.
         residuals: of the motions.
         covariances: (n, 6, 6) of [rotation rad, direction].
-        noise_pulls: (n,) half of the expected change of the squared whitened residual as the offset grows and
-            the LiDAR's noise is averaged more or less [1/s].
+        noise_slopes: (n,) half of the expected change of the squared whitened residual as the offset grows
+            and the LiDAR's noise is averaged more or less [1/s].
         rows_H_step: (n, 6, 6) the residual by a right perturbation of the LiDAR's motion, in units of the
             scaled noise.
     """
@@ -159,7 +159,7 @@ class HandEyeTerms:
     pairs: MotionPairs
     residuals: MotionResiduals
     covariances: FloatArray
-    noise_pulls: FloatArray
+    noise_slopes: FloatArray
     rows_H_step: FloatArray
 
     def __len__(self) -> int:
@@ -207,15 +207,15 @@ def hand_eye_terms(pairs: MotionPairs, state: State) -> tuple[HandEyeTerms, Nois
     terms = _terms(pairs, state)
     directed = terms.residuals.directed
     error, C = terms.residuals.evaluate(state.cTl, state.time_offsets_s[0], False)[0], terms.covariances
-    turns = _whitened_lengths(error[:, :3], C[:, :3, :3])
-    swerves = _whitened_lengths(error[:, 3:], C[:, 3:, 3:])
+    rotation_sizes = _whitened_lengths(error[:, :3], C[:, :3, :3])
+    direction_sizes = _whitened_lengths(error[:, 3:], C[:, 3:, 3:])
     scales = NoiseScales(
-        max(_scale(turns, 3), _LEAST_SCALE),
-        max(_scale(swerves[directed], 2), _LEAST_SCALE) if directed.any() else 1.0,
+        max(_scale(rotation_sizes, 3), _LEAST_SCALE),
+        max(_scale(direction_sizes[directed], 2), _LEAST_SCALE) if directed.any() else 1.0,
     )
-    turn_weights = _KERNEL.weight(turns / (scales.rotation * np.sqrt(3.0)))
-    swerve_weights = _KERNEL.weight(swerves / (scales.direction * np.sqrt(2.0)))
-    weights = np.maximum(np.stack([turn_weights, swerve_weights], axis=1), 1e-6)
+    rotation_weights = _KERNEL.weight(rotation_sizes / (scales.rotation * np.sqrt(3.0)))
+    direction_weights = _KERNEL.weight(direction_sizes / (scales.direction * np.sqrt(2.0)))
+    weights = np.maximum(np.stack([rotation_weights, direction_weights], axis=1), 1e-6)
     return _scaled(terms, scales, weights), scales
 
 
@@ -238,8 +238,8 @@ def hand_eye_graph(terms: HandEyeTerms, centre: State) -> gtsam.NonlinearFactorG
     graph.add(gtsam.PriorFactorPose3(EXTRINSIC, centre.cTl, noise))
     # An offset between two stamps of the LiDAR averages its noise, which looks like a better fit. A linear
     # cost takes back what that is expected to gain; together with the prior it is a prior elsewhere.
-    pull = float(terms.noise_pulls.sum())
-    mean_s = centre.time_offsets_s[0] + pull * sigma_s**2
+    slope = float(terms.noise_slopes.sum())
+    mean_s = centre.time_offsets_s[0] + slope * sigma_s**2
     graph.add(time_offset_prior(time_offset_key(), mean_s, sigma_s))
     return graph
 
@@ -285,7 +285,7 @@ def _terms(pairs: MotionPairs, state: State) -> HandEyeTerms:
     carried = transfer @ Ad
     own[~residuals.directed, 3:] = own[~residuals.directed, :, 3:] = carried[~residuals.directed, 3:] = 0.0
     own[~residuals.directed, 3:, 3:] = np.eye(3)
-    return HandEyeTerms(pairs, residuals, own, _noise_pulls(own, carried, lidars), carried)
+    return HandEyeTerms(pairs, residuals, own, _noise_slopes(own, carried, lidars), carried)
 
 
 def _scaled(terms: HandEyeTerms, scales: NoiseScales, weights: FloatArray) -> HandEyeTerms:
@@ -296,11 +296,11 @@ def _scaled(terms: HandEyeTerms, scales: NoiseScales, weights: FloatArray) -> Ha
     widened[~terms.residuals.directed, 3:] = 1.0
     own = widened[:, :, None] * widened[:, None, :] * terms.covariances
     carried = spread[:, :, None] * terms.rows_H_step
-    pulls = _noise_pulls(own, carried, terms.pairs.lidars)
-    return replace(terms, covariances=own, noise_pulls=pulls, rows_H_step=carried)
+    slopes = _noise_slopes(own, carried, terms.pairs.lidars)
+    return replace(terms, covariances=own, noise_slopes=slopes, rows_H_step=carried)
 
 
-def _noise_pulls(covariances: FloatArray, rows_H_step: FloatArray, lidars: PathSteps) -> FloatArray:
-    """``noise_pulls`` of :class:`HandEyeTerms`."""
+def _noise_slopes(covariances: FloatArray, rows_H_step: FloatArray, lidars: PathSteps) -> FloatArray:
+    """``noise_slopes`` of :class:`HandEyeTerms`."""
     rates = rows_H_step @ lidars.covariance_rates @ np.swapaxes(rows_H_step, 1, 2)
     return np.asarray(0.5 * np.trace(np.linalg.solve(covariances, rates), axis1=1, axis2=2))

@@ -93,11 +93,6 @@ class MotionSolution:
             "scene with more texture that does not move, and check the stamps"
         )
 
-    @property
-    def doubt(self) -> str:
-        """:attr:`misfit` in brackets, to end a sentence with; empty where there is none."""
-        return "" if self.misfit is None else f" ({self.misfit})"
-
 
 def solve_motion(
     drives: Sequence[Drive],

@@ -13,7 +13,7 @@ from sst_graph.association.time_pairing import pair_by_time
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.graph.matching import Tracks
+from sst_graph.graph.drive_motion import DriveMotion
 from sst_graph.graph.state import State
 from sst_graph.initialization.global_search import (
     COARSE,
@@ -44,13 +44,13 @@ class StartProblem:
 
     Attributes:
         drives: all of them.
-        tracks: their twists.
+        motions: of the LiDAR in each.
         classes: that are compared.
         guess: what is known beforehand.
     """
 
     drives: Sequence[Drive]
-    tracks: Tracks
+    motions: Sequence[DriveMotion]
     classes: Sequence[SemanticClass]
     guess: Guess
 
@@ -122,7 +122,7 @@ def _search_frames(problem: StartProblem, number: int, most: int) -> list[Search
     frames = []
     for pair in evenly_spread(usable, most):
         scan, image = drive.scans[pair.scan], drive.images[pair.image]
-        sample = problem.tracks.at(number, image.stamp_ns + round(time_offset_s * 1e9))
+        sample = problem.motions[number].at(image.stamp_ns + round(time_offset_s * 1e9))
         twist = np.zeros(6) if sample is None else sample.twist
         frames.append(SearchFrame(scan.lPs, scan.classes, image.mask, pair.base_tau_s, twist))
     return frames

@@ -305,6 +305,7 @@ class _Region:
 
 
 _PEAKS_AT_ONCE = 512
+"""States that are compared with the chosen ones at once."""
 
 
 def _peaks(states: States, scores: FloatArray, count: int, apart_rad: float) -> tuple[States, FloatArray]:

@@ -29,6 +29,7 @@ CELLS = (10, 32)
 _WRONG_LABELS = 0.1
 """Share of labels that are no better than chance: a vote against a pose is never below its logarithm."""
 _BATCH_POINTS = 400_000
+"""Points, times poses, that are projected at once: some megabytes an array."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,8 @@ class SearchFrame:
         classes: (n,) uint8 of SemanticClass; points of a class that is not searched count as the rest.
         mask: (h, w) uint8 of SemanticClass.
         base_tau_s: image stamp minus scan stamp [s].
-        c_twist: (6,) camera twist [rad/s, m/s] under the guess, or l_twist where there is none.
+        l_twist: (6,) LiDAR twist at the image's instant under the guessed time offset; 0 without odometry
+            [rad/s, m/s].
     """
 
     lPs: FloatArray
@@ -74,16 +76,19 @@ class AgreementMap:
     """All points and masks at one blur: what scores poses.
 
     Attributes:
-        camera: full-sized; masks are ``shrink`` times smaller, ``shape`` rows and columns.
+        camera: of the images at full size.
         lPs: (n, 3) points at their image's instant when the time offset is 0 [m].
-        velocities: (n, 3) of the points as the LiDAR sees them [m/s]; first order in the offset.
+        velocities: (n, 3) of the LiDAR past each point, minus the velocity that it sees the point move with
+            [m/s]; first order in the offset.
         starts: (n,) where the table of the point's frame and class begins in ``tables``.
         cells: (rows * columns,) cell of a pixel within its image.
         first_cells: (n,) number of the first cell of the point's image.
         tables: of all frames and classes: log-likelihood ratios for votes, shares for dependence.
         weights: (n,) of the votes.
         classes: (n,) number of each point's class; ``class_count`` for the rest.
+        class_count: classes that are searched.
         cell_count: cells of all images.
+        shrink, shape: the tables are so many times smaller than the images; their rows and columns.
         kind: which score.
     """
 
@@ -189,7 +194,17 @@ def _reach(centre: float, width: int, focal: float) -> np.float32:
 
 @dataclass(frozen=True)
 class LabelledPoints:
-    """Sampled points of all frames, and the masks that they are compared with."""
+    """Sampled points of all frames, and the masks that they are compared with.
+
+    Attributes:
+        camera: of the images.
+        frames: that the points are from.
+        classes: that are searched.
+        lPs: (n, 3) points [m].
+        frame_of: (n,) number of each point's frame.
+        class_of: (n,) number of its class; ``len(classes)`` for the rest.
+        weights: (n,) of its vote.
+    """
 
     camera: PinholeCamera
     frames: Sequence[SearchFrame]
@@ -268,7 +283,7 @@ class LabelledPoints:
         )
 
     def _velocities(self) -> FloatArray:
-        """(n, 3) negative apparent velocity of each point in the LiDAR frame [m/s]."""
+        """(n, 3) as ``velocities`` of :class:`AgreementMap`: omega x p + v."""
         twists = np.stack([frame.l_twist for frame in self.frames])[self.frame_of]
         return np.cross(twists[:, :3], self.lPs) + twists[:, 3:]
 

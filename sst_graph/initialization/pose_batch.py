@@ -36,6 +36,7 @@ from sst_graph.initialization.label_agreement import States
 from sst_graph.types import FloatArray, IntArray, SemanticClass
 
 _MIN_DEPTH_M = 0.5
+"""Nearer points are not projected: no object is so close [m]."""
 _REACH_M = 3.0
 """Farthest that a point moves between its scan and its image [m]: 30 m/s for a tenth of a second."""
 _MIN_OBJECT_SHARE = 0.3
@@ -153,7 +154,7 @@ class PoseBatch:
         points = edges.points
         # (3, n) points, and the step from each to its neighbour outside the object [m].
         self._lPs = np.ascontiguousarray(points.lPs.T)
-        self._ways = np.ascontiguousarray((points.outward - points.lPs).T)
+        self._steps = np.ascontiguousarray((points.outward - points.lPs).T)
         self._scans = np.array(edges.scans)[edges.group_of]
         self._classes = np.array([self.classes.index(c) for c in edges.classes])[edges.group_of]
 
@@ -175,17 +176,17 @@ class PoseBatch:
         R = _by_row(poses.rotations)
         close = seen.take(near)
         turns = R.take(close.pose, axis=1)
-        way, length = _directions(
-            self.camera, close.cPs, _rotated(turns, self._ways.take(close.point, axis=1))
+        direction, length = _directions(
+            self.camera, close.cPs, _rotated(turns, self._steps.take(close.point, axis=1))
         )
-        cosine = way[0] * normals[0] + way[1] * normals[1]
+        cosine = direction[0] * normals[0] + direction[1] * normals[1]
         seen_owners = np.bincount(owner, minlength=1)
         matched = of_matched_objects(faces(cosine), owner[near], seen_owners, _MIN_OBJECT_SHARE)
         on = np.flatnonzero(matched)
         close, owner, r = close.take(on), owner[near[on]], r[on]
         # 2. Their weights.
         sigma = match_sigmas(length[on], cosine[on], config)
-        sides = sides_of(self.edges.points.edges[close.point], way[0, on])
+        sides = sides_of(self.edges.points.edges[close.point], direction[0, on])
         robust = kernel.weight(r / sigma)
         weight = robust * side_weights(owner, sides, sigma, config) / sigma**2
         # 3. Normal equations.
@@ -212,7 +213,7 @@ class PoseBatch:
         shifts = np.rint(1e9 * offsets).astype(np.int64)[:, None]
         near, which = np.unique((stamps[images] + shifts)[seen] // _NEAR_NS, return_inverse=True)
         instants = (near * _NEAR_NS + _NEAR_NS // 2).tolist()
-        samples = self.edges.tracks.at_all(self.edges.number, instants)
+        samples = self.edges.motion.at_all(instants)
         if samples is None or not samples.twists.any():
             return _Pairing(images, taus, None, None)
         twists, accelerations = np.zeros((2, *images.shape, 6))
@@ -324,14 +325,14 @@ def _by_row(each: FloatArray) -> FloatArray:
     return np.ascontiguousarray(each.reshape(len(each), -1).T)
 
 
-def _directions(camera: PinholeCamera, cPs: FloatArray, ways: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _directions(camera: PinholeCamera, cPs: FloatArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
     """(2, k) unit outward directions of the objects in the image, and the lengths (k,) of the steps [px].
 
     Args:
-        cPs, ways: (3, k) points, and the steps to their neighbours outside the objects, in the camera [m].
+        cPs, steps: (3, k) points, and the steps to their neighbours outside the objects, in the camera [m].
     """
     X, Y, Z = cPs
-    dX, dY, dZ = ways
+    dX, dY, dZ = steps
     farther = np.maximum(Z + dZ, _MIN_DEPTH_M)
     step = np.stack([camera.fx * (dX - dZ * X / Z), camera.fy * (dY - dZ * Y / Z)]) / farther
     length = np.sqrt(step[0] ** 2 + step[1] ** 2)

@@ -1,10 +1,11 @@
 """The start of the joint method: candidates, refined side by side, and the best of them selected.
 
 1. Candidates: poses of a grid whose labels agree (:mod:`~sst_graph.initialization.candidates`).
-2. Refinement: all of them by silhouettes on some scans, under narrowing kernels; the worse ones, and those
-that have converged to one pose, are dropped from stage to stage
-(:mod:`~sst_graph.initialization.refinement`). 3. Selection: the best by silhouettes and by the labels of all
-points, and alternatives that are nearly as good.
+2. Refinement (:mod:`~sst_graph.initialization.refinement`): all of them by silhouettes on some scans, under
+   narrowing kernels; the worse ones, and those that have converged to one pose, are dropped from stage to
+   stage.
+3. Selection: the best by silhouettes and by the labels of all points, and alternatives that are nearly as
+   good.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from sst_graph.initialization.candidates import StartProblem, candidate_steps, l
 from sst_graph.initialization.global_search import Candidate, SearchConfig
 from sst_graph.initialization.pose_batch import BatchEquations, Poses
 from sst_graph.initialization.refinement import RefinementProblem, refine_steps
+from sst_graph.metrics import turn_rad
 from sst_graph.sampling import evenly_spread
 from sst_graph.stepwise import Stepwise
 from sst_graph.types import Calibration, FloatArray, IntArray
@@ -128,7 +130,7 @@ def select_among_steps(
     """
     # 1. All candidates under wide kernels, on some of the points.
     few = [replace(drive, scans=tuple(evenly_spread(drive.scans, most_scans))) for drive in problem.drives]
-    full = RefinementProblem.of(edges_of(few, problem.tracks, graph), graph)
+    full = RefinementProblem.of(edges_of(few, problem.motions, graph), graph)
     rough = full.thinned(_WIDE_POINTS)
     yield 10
     poses = _poses(_with_offsets(candidates, problem.guess.time_offset_s), full.biases)
@@ -258,8 +260,3 @@ def _in_reach(poses: Poses, guess: gtsam.Pose3 | None, config: SearchConfig) -> 
         return np.asarray(np.linalg.norm(poses.translations, axis=1) < REACH * config.free_translation_m)
     away = np.abs(poses.translations - np.asarray(guess.translation()))
     return np.asarray((away < REACH * config.translation_m).all(axis=1))
-
-
-def turn_rad(one: gtsam.Pose3, other: gtsam.Pose3) -> float:
-    """Angle between two rotations [rad]."""
-    return float(np.linalg.norm(gtsam.Rot3.Logmap(one.rotation().between(other.rotation()))))

@@ -8,9 +8,10 @@ import gtsam
 import numpy as np
 
 from sst_graph.factors.camera import PinholeCamera
+from sst_graph.factors.motion import skew
 from sst_graph.odometry.depth import RANGE_SIGMA, InverseDepths, inverse_depths
 from sst_graph.odometry.features import Tracks
-from sst_graph.odometry.relative import MIN_NOISE_PX, DirectionMotion, huber_weights, rays, skew
+from sst_graph.odometry.relative import MIN_NOISE_PX, DirectionMotion, huber_weights, rays
 from sst_graph.types import BoolArray, FloatArray, RelativeMotion
 
 MIN_SCALED_DEPTH = 1e-2

@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 
 from sst_graph.factors.camera import PinholeCamera
+from sst_graph.factors.motion import skew
 from sst_graph.odometry.features import Tracks
 from sst_graph.types import BoolArray, FloatArray
 
@@ -114,16 +115,6 @@ def _cross(left: FloatArray, right: FloatArray) -> FloatArray:
     """(n, 3) cross products of rows; several times faster than ``np.cross``."""
     a, b = left.T, right.T
     return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]], axis=1)
-
-
-def skew(vectors: FloatArray) -> FloatArray:
-    """(n, 3, 3) cross-product matrices of vectors (n, 3)."""
-    result = np.zeros((len(vectors), 3, 3))
-    x, y, z = vectors.T
-    result[:, 0, 1], result[:, 0, 2] = -z, y
-    result[:, 1, 0], result[:, 1, 2] = z, -x
-    result[:, 2, 0], result[:, 2, 1] = -y, x
-    return result
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from sst_graph.drive.preparation import Drive
 from sst_graph.edges.turns import turned_states
 from sst_graph.fit import CLOSE_PX, MOST_POINTS, Fit, FitQuality, OuterIteration, Profile
-from sst_graph.graph.matching import GraphConfig, Tracks, edges_of
+from sst_graph.graph.drive_motion import DriveMotion
+from sst_graph.graph.matching import GraphConfig, edges_of
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import ObjectId
 from sst_graph.quality.close_points import attainable_share, close_share
@@ -31,7 +32,7 @@ class FitOfDrives:
     def __init__(
         self,
         drives: Sequence[Drive],
-        tracks: Tracks,
+        motions: Sequence[DriveMotion],
         objects: Sequence[dict[ObjectId, int]],
         config: GraphConfig,
         seed: int = 0,
@@ -45,7 +46,7 @@ class FitOfDrives:
         """
         self.objects, self.seed = objects, seed
         self.by_edges = has_edges(drives)
-        self.edges = edges_of(drives, tracks, replace(config, edge_place="strongest"))
+        self.edges = edges_of(drives, motions, replace(config, edge_place="strongest"))
 
     def measured(self, state: State) -> Measured | None:
         """Boundary points that have a contour or an edge nearby; None without any."""

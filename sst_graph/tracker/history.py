@@ -38,40 +38,40 @@ class HistoryEntry:
 def smoothed_epochs(past: Iterable[RetiredEpoch], smoother: WindowSmoother) -> list[HistoryEntry]:
     """The calibration of each epoch given all of them: those that have left the window, then its own."""
     epochs = [*past, *smoother.live_epochs()]
-    walks = [smoother.walk(max(1e-3, (b.start_ns - a.start_ns) * 1e-9)) for a, b in pairwise(epochs)]
+    walks = [smoother.walk(a, b) for a, b in pairwise(epochs)]
     point = smoother.point.core()
-    beliefs = [_cluster_robust(epoch, point) for epoch in epochs]
-    forward = _messages(beliefs, walks, smoother.prior)
+    gaussians = [_cluster_robust(epoch, point) for epoch in epochs]
+    forward = _messages(gaussians, walks, smoother.prior)
     nothing = Gaussian(point, np.zeros((point.size, point.size)), np.zeros(point.size))
-    backward = _messages(beliefs[::-1], walks[::-1], nothing)[::-1]
+    backward = _messages(gaussians[::-1], walks[::-1], nothing)[::-1]
     entries = []
-    for epoch, belief, a, b in zip(epochs, beliefs, forward, backward, strict=True):
-        total = belief.plus(a).plus(b)
+    for epoch, own, a, b in zip(epochs, gaussians, forward, backward, strict=True):
+        total = own.plus(a).plus(b)
         best = total.mean()
         covariance = scaled_inverse(total.information)[:7, :7]
         entries.append(HistoryEntry(epoch.start_ns, best.cTl, best.time_offset_s, covariance))
     return entries
 
 
-def _messages(beliefs: Sequence[Gaussian], walks: Sequence[FloatArray], first: Gaussian) -> list[Gaussian]:
+def _messages(gaussians: Sequence[Gaussian], walks: Sequence[FloatArray], first: Gaussian) -> list[Gaussian]:
     """Gaussian on each epoch by those before it, through the random walk."""
     messages = [first]
-    for belief, walk in zip(beliefs[:-1], walks, strict=True):
-        messages.append(belief.plus(messages[-1]).drifted(walk))
+    for own, walk in zip(gaussians[:-1], walks, strict=True):
+        messages.append(own.plus(messages[-1]).drifted(walk))
     return messages
 
 
 def _cluster_robust(epoch: RetiredEpoch, point: Point) -> Gaussian:
     """The epoch's Gaussian with its cluster-robust information: H M^-1 H, M = H + excess."""
-    belief = epoch.information.at(point)
-    H = belief.information
+    own = epoch.information.at(point)
+    H = own.information
     diagonal = np.diag(H)
     if not (diagonal > 0.0).any():
-        return belief
+        return own
     scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-12 * diagonal.max()))
     K = H * np.outer(scale, scale)
     M = K + epoch.excess * np.outer(scale, scale) + 1e-9 * np.eye(len(H))
     shrink = np.linalg.solve(M, K).T  # K M^-1
     information = shrink @ K / np.outer(scale, scale)
-    vector = (shrink @ (belief.vector * scale)) / scale
+    vector = (shrink @ (own.vector * scale)) / scale
     return Gaussian(point, 0.5 * (information + information.T), vector)

@@ -21,7 +21,7 @@ Colour = tuple[int, int, int]
 IN_MASK: Colour = (80, 220, 60)
 OUT_OF_MASK: Colour = (60, 60, 255)
 CONTOUR: Colour = (0, 230, 255)
-NOT_ASKED: Colour = (0, 110, 200)
+NOT_MATCHED: Colour = (0, 110, 200)
 CLASS_COLOURS: dict[SemanticClass, Colour] = {
     SemanticClass.GROUND: (160, 90, 130),
     SemanticClass.TERRAIN: (110, 150, 110),
@@ -202,7 +202,7 @@ def _draw_contours(picture: Picture, contour: ContourMap | None, zoom: int) -> N
     )
     for columns, rows in (outline[:, 0].T for outline in outlines):
         unknown = contour.unknown[rows // zoom, columns // zoom] > 0
-        colours = np.where(unknown[:, None], NOT_ASKED, CONTOUR)
+        colours = np.where(unknown[:, None], NOT_MATCHED, CONTOUR)
         picture[rows + contour.top * zoom, columns + contour.left * zoom] = colours
 
 
@@ -221,7 +221,7 @@ def _by_class(caption: str, inside: int, outside: int) -> list[tuple[str, Colour
         (f"vehicle points in the mask: {share}", IN_MASK),
         (f"outside: {outside}", OUT_OF_MASK),
         ("contour", CONTOUR),
-        ("not matched", NOT_ASKED),
+        ("not matched", NOT_MATCHED),
     ]
 
 

@@ -234,9 +234,9 @@ def test_the_offset_of_every_drive_counts() -> None:
 def test_parts_have_the_tracks_of_their_scans() -> None:
     drives = prepared()
     parts, scans = parts_of(drives), (3, 4, 5, 6, 10, 11)
-    tracks = parts.problem.tracks.part(0, scans)
-    assert tracks.objects is not None
-    own = tracks.objects[0]
+    motion = parts.problem.motions[0].part(scans)
+    assert motion.objects is not None
+    own = motion.objects
     for (scan, c, n), track in own.items():
         assert parts.problem.objects[0][scans[scan], c, n] == track
     assert len(own) == sum(scan in scans for scan, _, _ in parts.problem.objects[0])

@@ -13,7 +13,8 @@ from sst_graph.batch.config import UseLowerEdges
 from sst_graph.batch.lower_edges import MIN_CONCENTRATION, lower_edge_support, with_lower_edges
 from sst_graph.drive.preparation import Drive, image_features
 from sst_graph.features.lidar_edges import Edge
-from sst_graph.graph.matching import Tracks, associate
+from sst_graph.graph.drive_motion import motions_of
+from sst_graph.graph.matching import associate
 from sst_graph.graph.outer_loop import (
     NARROW_KERNELS_PX,
     JointConfig,
@@ -58,14 +59,14 @@ def test_edges_towards_the_ground_are_kept_apart() -> None:
 
 
 def test_matched_where_they_are_asked_for() -> None:
-    drive, tracks = prepared_street(), Tracks([prepared_street()])
+    drive, motions = prepared_street(), motions_of([prepared_street()])
     state, kernel = (
         State(standing_street().truth.cTl),
         solved(drive)[0].pairs[0].matches[VEHICLE].alignment.kernel,
     )
-    without = associate([drive], tracks, state, kernel, JOINT.graph)
+    without = associate([drive], motions, state, kernel, JOINT.graph)
     graph = replace(JOINT.graph, lower_edges=(VEHICLE,))
-    for few, many in zip(without, associate([drive], tracks, state, kernel, graph), strict=True):
+    for few, many in zip(without, associate([drive], motions, state, kernel, graph), strict=True):
         assert not (few.matches[VEHICLE].sides == 3).any()
         assert (many.matches[VEHICLE].sides == 3).sum() > 10
         assert (many.matches[VEHICLE].sides < 3).sum() >= len(few)
@@ -73,7 +74,7 @@ def test_matched_where_they_are_asked_for() -> None:
 
 def test_used_where_the_labels_agree() -> None:
     drive = street()
-    below = with_lower_edges(JointProblem([drive], Tracks([drive]), JOINT), [solved(drive)], "auto")
+    below = with_lower_edges(JointProblem([drive], motions_of([drive]), JOINT), [solved(drive)], "auto")
     assert below.joint.graph.lower_edges == (VEHICLE,)
     assert below.concentration[VEHICLE] > MIN_CONCENTRATION
     truth = standing_street().truth.cTl
@@ -88,10 +89,10 @@ def test_used_where_the_labels_agree() -> None:
 def test_left_out_where_the_shadow_belongs_to_the_mask(use: UseLowerEdges) -> None:
     drive = street(shadow_px=5)
     one, centre = solved(drive)
-    tracks = Tracks([drive])
-    shares = lower_edge_support([drive], tracks, one.state, JOINT).agreed(use)[1]
+    motions = motions_of([drive])
+    shares = lower_edge_support([drive], motions, one.state, JOINT).agreed(use)[1]
     assert shares[VEHICLE] < MIN_CONCENTRATION
-    below = with_lower_edges(JointProblem([drive], tracks, JOINT), [(one, centre)], use)
+    below = with_lower_edges(JointProblem([drive], motions, JOINT), [(one, centre)], use)
     if use == "always":
         assert below.joint.graph.lower_edges == (VEHICLE,)
     else:
@@ -102,6 +103,6 @@ def test_too_few_say_nothing() -> None:
     drive = street()
     one, _ = solved(drive)
     assert (
-        lower_edge_support([drive], Tracks([drive]), one.state, JOINT).agreed("auto", min_support=1e6)[1]
+        lower_edge_support([drive], motions_of([drive]), one.state, JOINT).agreed("auto", min_support=1e6)[1]
         == {}
     )

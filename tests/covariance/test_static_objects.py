@@ -14,7 +14,8 @@ from sst_graph.covariance.cluster_robust import RobustCovariance, robust_covaria
 from sst_graph.covariance.static_objects import static_covariance
 from sst_graph.factors import RobustKernel
 from sst_graph.graph.building import joint_graph
-from sst_graph.graph.matching import GraphConfig, PairMatches, Tracks, associate
+from sst_graph.graph.drive_motion import motions_of
+from sst_graph.graph.matching import GraphConfig, PairMatches, associate
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import ObjectId, object_tracks
 from sst_graph.types import Guess, SemanticClass
@@ -27,7 +28,7 @@ def matched() -> tuple[State, list[PairMatches], dict[ObjectId, int]]:
     drive = prepared_street()
     tracks, state = object_tracks(drive), State(standing_street().truth.cTl)
     kernel = RobustKernel("geman_mcclure", 3.0)
-    return state, associate([drive], Tracks([drive], [tracks]), state, kernel, CONFIG), tracks
+    return state, associate([drive], motions_of([drive], [tracks]), state, kernel, CONFIG), tracks
 
 
 def robust_of(pairs: list[PairMatches], state: State, tracks: dict[ObjectId, int]) -> RobustCovariance:

@@ -31,7 +31,8 @@ from sst_graph.export import (
 from sst_graph.factors import Alignment, FactorError, RobustKernel, frame_factor, residuals, time_offset_prior
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.graph.building import joint_graph
-from sst_graph.graph.matching import GraphConfig, Tracks, associate
+from sst_graph.graph.drive_motion import motions_of
+from sst_graph.graph.matching import GraphConfig, associate
 from sst_graph.graph.state import State
 from sst_graph.result import CalibrationResult
 from sst_graph.simulator import SimulationConfig
@@ -309,7 +310,7 @@ def _matched(number: int) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     prepared = prepare_drive(source, [SemanticClass.VEHICLE], PrepareConfig(use_visual_odometry=False))
     state = State(source.truth.cTl.retract(np.full(6, 2e-3)), (street.time_offset_s,))
     config = GraphConfig(object_bias_sigma_px=0.0)
-    pairs = associate([prepared], Tracks([prepared]), state, RobustKernel("geman_mcclure", 5.0), config)
+    pairs = associate([prepared], motions_of([prepared]), state, RobustKernel("geman_mcclure", 5.0), config)
     # the second drive's own variables get the numbers of a drive 1
     pairs = [replace(pair, drive=number) for pair in pairs]
     graph, values = joint_graph(pairs, state, config)

@@ -11,7 +11,8 @@ from streets import prepared_street, standing_street
 
 from sst_graph.factors import RobustKernel
 from sst_graph.graph.building import PRIOR_ROTATION_SIGMA_RAD, joint_graph, state_from, tracked_objects
-from sst_graph.graph.matching import GraphConfig, PairMatches, Tracks, associate, edges_of, match_all
+from sst_graph.graph.drive_motion import motions_of
+from sst_graph.graph.matching import GraphConfig, PairMatches, associate, edges_of, match_all
 from sst_graph.graph.state import EXTRINSIC, State, bias_key, object_bias_key, time_offset_key, twist_key
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.types import SemanticClass
@@ -22,9 +23,9 @@ CONFIG = GraphConfig()
 
 def matched(by_object: bool) -> tuple[State, list[PairMatches]]:
     source, drive = standing_street(0.0), prepared_street(0.0)
-    tracks = Tracks([drive], [object_tracks(drive)] if by_object else None)
+    motions = motions_of([drive], [object_tracks(drive)] if by_object else None)
     state = State(source.truth.cTl)
-    return state, associate([drive], tracks, state, RobustKernel("geman_mcclure", 3.0), CONFIG)
+    return state, associate([drive], motions, state, RobustKernel("geman_mcclure", 3.0), CONFIG)
 
 
 def test_keys_are_distinct() -> None:
@@ -60,7 +61,7 @@ def test_part_of_the_way_to_another_state() -> None:
 
 def test_matches_know_their_boundary_points_beside_objects_of_unknown_speed() -> None:
     source, drive = standing_street(0.0), prepared_street(0.0)
-    edges = edges_of([drive], Tracks([drive]), CONFIG)
+    edges = edges_of([drive], motions_of([drive]), CONFIG)
     fast = np.where(np.isin(edges[0].owners, np.unique(edges[0].owners)[::2]), 30.0, 0.0)
     away = State(source.truth.cTl, (0.01,))
     (matches,) = match_all([replace(edges[0], unknown_mps=fast)], away, RobustKernel("geman_mcclure", 3.0))

@@ -14,9 +14,10 @@ from sst_graph.covariance.cluster_robust import robust_covariance
 from sst_graph.drive.preparation import Drive, ScanFeatures
 from sst_graph.factors import RobustKernel
 from sst_graph.graph.building import joint_graph, state_from
+from sst_graph.graph.drive_motion import DriveMotion, motions_of
 from sst_graph.graph.frozen_problem import FrozenProblem, NormalEquations
 from sst_graph.graph.known import KnownCalibration
-from sst_graph.graph.matching import DriveMatches, GraphConfig, Tracks, associate, edges_of, match_all
+from sst_graph.graph.matching import DriveMatches, GraphConfig, associate, edges_of, match_all
 from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
 from sst_graph.objects.dynamic_objects import DynamicObject
 from sst_graph.objects.tracks import ObjectId, object_tracks
@@ -52,8 +53,8 @@ def moving(rolling: bool) -> Drive:
 
 
 def matched(drives: list[Drive], state: State, config: GraphConfig, by_object: bool) -> list[DriveMatches]:
-    tracks = Tracks(drives, [object_tracks(drive) for drive in drives] if by_object else None)
-    return match_all(edges_of(drives, tracks, config), state, KERNEL)
+    motions = motions_of(drives, [object_tracks(drive) for drive in drives] if by_object else None)
+    return match_all(edges_of(drives, motions, config), state, KERNEL)
 
 
 def whole(system: NormalEquations) -> tuple[np.ndarray, np.ndarray]:
@@ -133,15 +134,16 @@ def test_several_images_of_a_scan_are_matched_each_by_itself() -> None:
     drive, config = dense(), replace(PLAIN, every_image=True)
     assert drive.has_dense_images and drive.part([0, 2]).has_dense_images
     state = State(standing_street().truth.cTl, (0.0,), {(0, VEHICLE): 0.4}, {})
-    tracks, objects = Tracks([drive], [object_tracks(drive)]), object_tracks(drive)
-    together = associate([drive], tracks, state, KERNEL, config)
+    objects = object_tracks(drive)
+    motions = motions_of([drive], [objects])
+    together = associate([drive], motions, state, KERNEL, config)
     assert [(pair.pair.scan, pair.pair.image) for pair in together] == [(k // 3, k) for k in range(9)]
     for pair in together:
         (alone,) = (
             one
             for one in associate(
                 [replace(drive, images=drive.images[pair.pair.image : pair.pair.image + 1])],
-                tracks,
+                motions,
                 state,
                 KERNEL,
                 PLAIN,
@@ -165,9 +167,9 @@ def test_several_images_of_a_scan_are_matched_each_by_itself() -> None:
     robust = robust_covariance(graph, values, together, state, [objects])
     assert sorted(set(robust.table.frames.tolist())) == [0, 1, 2]
     # Without the setting, or at equal rates, a scan has its nearest image alone.
-    nearest = associate([drive], tracks, state, KERNEL, PLAIN)
+    nearest = associate([drive], motions, state, KERNEL, PLAIN)
     assert [(pair.pair.scan, pair.pair.image) for pair in nearest] == [(k, 3 * k + 1) for k in range(3)]
-    plain = [associate([moving(False)], tracks, state, KERNEL, one) for one in (PLAIN, config)]
+    plain = [associate([moving(False)], motions, state, KERNEL, one) for one in (PLAIN, config)]
     assert [p.pair for p in plain[0]] == [p.pair for p in plain[1]] and len(plain[0]) == 3
 
 
@@ -177,11 +179,12 @@ def test_all_scans_are_matched_as_each_by_itself(rolling: bool, time_offset_s: f
     drive = moving(rolling)
     values = {"range_scale": -0.001, "k1": 0.01, "skew": 1e-3}
     state = State(standing_street().truth.cTl, (time_offset_s,), {(0, VEHICLE): 0.4}, {}, values)
-    tracks, objects = Tracks([drive], [object_tracks(drive)]), object_tracks(drive)
-    together = {pair.pair.scan: pair for pair in associate([drive], tracks, state, KERNEL, FREE)}
+    objects = object_tracks(drive)
+    motions = motions_of([drive], [objects])
+    together = {pair.pair.scan: pair for pair in associate([drive], motions, state, KERNEL, FREE)}
     assert len(together) >= 2
     for scan in range(len(drive.scans)):
-        alone = associate([drive.part([scan])], tracks.part(0, [scan]), state, KERNEL, FREE)
+        alone = associate([drive.part([scan])], [motions[0].part([scan])], state, KERNEL, FREE)
         assert len(alone) == (scan in together)
         for pair in alone:
             both, own = together[scan].matches[VEHICLE], pair.matches[VEHICLE]
@@ -245,8 +248,8 @@ def test_moving_objects_are_matched_where_they_are() -> None:
         for name in list(tracks)[::2]
     }
     slow: dict[ObjectId, DynamicObject] = {name: DynamicObject(0.06) for name in list(tracks)[1::2]}
-    found = Tracks([drive]).with_objects(tracks, fast | slow)
-    matches = match_all(edges_of([drive], found, PLAIN), state, KERNEL)
+    motion = DriveMotion.of(drive).with_objects(tracks, fast | slow)
+    matches = match_all(edges_of([drive], [motion], PLAIN), state, KERNEL)
     pairs = [pair for own in matches for pair in own.by_pair()]
     assert any(m.alignment.l_velocities is not None for pair in pairs for m in pair.matches.values())
     graph, values = joint_graph(pairs, state, PLAIN)

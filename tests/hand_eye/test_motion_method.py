@@ -219,18 +219,18 @@ def test_from_the_command_line(street: Path, tmp_path: Path, start: str) -> None
 
 
 @pytest.mark.slow
-def test_the_joint_method_hears_the_motion(street: Path) -> None:
+def test_the_joint_method_uses_the_motion(street: Path) -> None:
     source = open_source(street, frames="0:12")
     # Labels that determine the offset to 11 ms, not to 3: the motion alone determines it to 32 ms.
     weak = ["search.enabled=false", "noise.side_sigma_px=10"]
     settings = with_overrides(CalibrationConfig(), weak)
-    deaf = calibrate(source, source.nominal, dataclasses.replace(settings, use_motion="never"))
-    hearing = calibrate(source, source.nominal, dataclasses.replace(settings, use_motion="auto"))
-    assert hearing.diagnostics["motion"]["fused"] is True and not deaf.diagnostics["motion"]
-    assert hearing.covariance[6, 6] < deaf.covariance[6, 6]
+    labels_alone = calibrate(source, source.nominal, dataclasses.replace(settings, use_motion="never"))
+    with_motion = calibrate(source, source.nominal, dataclasses.replace(settings, use_motion="auto"))
+    assert with_motion.diagnostics["motion"]["fused"] is True and not labels_alone.diagnostics["motion"]
+    assert with_motion.covariance[6, 6] < labels_alone.covariance[6, 6]
     truth = source.truth
     assert truth is not None and truth.time_offset_s is not None
-    assert abs(hearing.time_offset_s - truth.time_offset_s) < 4.0 * np.sqrt(hearing.covariance[6, 6])
+    assert abs(with_motion.time_offset_s - truth.time_offset_s) < 4.0 * np.sqrt(with_motion.covariance[6, 6])
 
 
 def test_one_clock_only() -> None:

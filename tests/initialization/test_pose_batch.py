@@ -15,8 +15,9 @@ from sst_graph.factors import CameraTwist, PinholeCamera, RobustKernel
 from sst_graph.features.lidar_edges import Boundaries
 from sst_graph.features.mask_contour import ContourMap
 from sst_graph.graph.building import PRIOR_TRANSLATION_SIGMA_M
+from sst_graph.graph.drive_motion import motions_of
 from sst_graph.graph.frozen_problem import FrozenProblem
-from sst_graph.graph.matching import GraphConfig, Tracks, edges_of, match_all
+from sst_graph.graph.matching import GraphConfig, edges_of, match_all
 from sst_graph.graph.state import State
 from sst_graph.initialization.pose_batch import BatchEquations, PoseBatch, Poses
 from sst_graph.types import RelativeMotion, SemanticClass
@@ -63,7 +64,7 @@ def scan_of(index: int, boundaries: dict[SemanticClass, Boundaries]) -> ScanFeat
 
 
 def batch_of(drive: Drive, config: GraphConfig | None = None) -> PoseBatch:
-    (edges,) = edges_of([drive], Tracks([drive]), config or GraphConfig())
+    (edges,) = edges_of([drive], motions_of([drive]), config or GraphConfig())
     return PoseBatch(edges)
 
 
@@ -139,7 +140,7 @@ def test_normal_equations_are_the_graphs(scale_px: float) -> None:
         cTl = gtsam.Pose3.Expmap(step)
         found = equations(drive, graph, poses(cTl), scale_px)
         state = State(cTl)
-        matches = match_all(edges_of([drive], Tracks([drive]), graph), state, kernel(scale_px))
+        matches = match_all(edges_of([drive], motions_of([drive]), graph), state, kernel(scale_px))
         frozen = FrozenProblem(matches, state, graph)
         system = frozen.linearized(frozen.start)
         # By cP' = Exp(w) cP + v instead of cTl Exp(xi): [w, v] = [R xi_w, R xi_v - (R xi_w) x t].

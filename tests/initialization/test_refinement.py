@@ -7,7 +7,8 @@ import numpy as np
 from streets import prepared_street, standing_street
 
 from sst_graph.drive.preparation import Drive, PrepareConfig, prepare_drive
-from sst_graph.graph.matching import GraphConfig, Tracks, edges_of
+from sst_graph.graph.drive_motion import motions_of
+from sst_graph.graph.matching import GraphConfig, edges_of
 from sst_graph.graph.outer_loop import KERNELS_PX, JointConfig, JointProblem, solve_joint
 from sst_graph.graph.state import State
 from sst_graph.initialization.pose_batch import BatchEquations, Poses
@@ -19,7 +20,7 @@ JOINT = JointConfig()
 
 
 def problem(*drives: Drive) -> RefinementProblem:
-    edges = edges_of(drives, Tracks(drives), GraphConfig())
+    edges = edges_of(drives, motions_of(drives), GraphConfig())
     return RefinementProblem.of(edges, GraphConfig())
 
 

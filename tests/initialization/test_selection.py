@@ -11,7 +11,7 @@ import pytest
 from streets import prepared_street, standing_street
 
 from sst_graph.errors import EstimationError
-from sst_graph.graph.matching import Tracks
+from sst_graph.graph.drive_motion import motions_of
 from sst_graph.graph.outer_loop import (
     KERNELS_PX,
     NARROW_KERNELS_PX,
@@ -48,7 +48,7 @@ JOINT, START = JointConfig(), SearchConfig()
 
 def start_problem(guess: gtsam.Pose3 | None, time_offset_s: float = 0.0) -> StartProblem:
     drives = [prepared_street()]
-    return StartProblem(drives, Tracks(drives), [VEHICLE], Guess(guess, time_offset_s))
+    return StartProblem(drives, motions_of(drives), [VEHICLE], Guess(guess, time_offset_s))
 
 
 def poses_of(cTls: list[gtsam.Pose3], offsets: list[float]) -> Poses:
@@ -139,7 +139,7 @@ def test_a_start_from_a_rough_guess_or_none(guess: bool) -> None:
     selection: Selection = run_to_end(select_start_steps(start_problem(rough), JOINT.graph, START))
     # It leads where the truth leads, which with the few vehicles of this street is 0.9 deg away.
     start = selection.starts[0].cTl
-    problem = JointProblem([prepared_street()], Tracks([prepared_street()]), JOINT)
+    problem = JointProblem([prepared_street()], motions_of([prepared_street()]), JOINT)
     found, best = (solve_joint(problem, State(cTl)).state.cTl for cTl in (start, truth()))
     assert off_deg(best) < 1.0
     assert np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(best.between(start).rotation()))) < 0.6

@@ -15,8 +15,9 @@ from sst_graph.covariance.match_table import MatchTable, match_table
 from sst_graph.drive.preparation import Drive, PrepareConfig, prepare_drive
 from sst_graph.factors import RobustKernel
 from sst_graph.graph.building import PRIOR_ROTATION_SIGMA_RAD, PRIOR_TRANSLATION_SIGMA_M, joint_graph
+from sst_graph.graph.drive_motion import motions_of
 from sst_graph.graph.elimination import Eliminated, Unknowns
-from sst_graph.graph.matching import GraphConfig, PairMatches, Tracks, associate
+from sst_graph.graph.matching import GraphConfig, PairMatches, associate
 from sst_graph.graph.state import State
 from sst_graph.inspect.frame_gains import frame_gains
 from sst_graph.inspect.frame_information import FrameInformation
@@ -39,7 +40,7 @@ def matched(motion: str) -> tuple[Drive, State, list[PairMatches], list[dict[Obj
     objects = [object_tracks(drive)]
     state = State(source.truth.cTl)
     kernel = RobustKernel("geman_mcclure", 3.0)
-    return drive, state, associate([drive], Tracks([drive], objects), state, kernel, CONFIG), objects
+    return drive, state, associate([drive], motions_of([drive], objects), state, kernel, CONFIG), objects
 
 
 @cache

@@ -12,7 +12,8 @@ from sst_graph.covariance.cluster_robust import robust_covariance
 from sst_graph.drive.preparation import PrepareConfig, prepare_drive
 from sst_graph.factors import RobustKernel
 from sst_graph.graph.building import joint_graph, state_from
-from sst_graph.graph.matching import PairMatches, Tracks, associate
+from sst_graph.graph.drive_motion import motions_of
+from sst_graph.graph.matching import PairMatches, associate
 from sst_graph.graph.outer_loop import KERNELS_PX, JointConfig, JointProblem, solve_joint
 from sst_graph.graph.state import State
 from sst_graph.inspect.frame_gains import frame_gains
@@ -45,8 +46,8 @@ def test_bits_and_sigmas_agree_with_leaving_the_frame_out() -> None:
     )
     drive = prepare_drive(source, [SemanticClass.VEHICLE], PrepareConfig(use_visual_odometry=False))
     config, objects = JointConfig(), [object_tracks(drive)]
-    tracks, truth = Tracks([drive], objects), State(source.truth.cTl, (0.05,))
-    solution = solve_joint(JointProblem([drive], tracks, config), truth)
+    motions, truth = motions_of([drive], objects), State(source.truth.cTl, (0.05,))
+    solution = solve_joint(JointProblem([drive], motions, config), truth)
     frozen = solution.graph, solution.values, solution.pairs, solution.state
     robust = robust_covariance(*frozen, objects)
     frames = frame_gains(*frozen, [drive], robust)
@@ -54,7 +55,7 @@ def test_bits_and_sigmas_agree_with_leaving_the_frame_out() -> None:
     steps = gtsam.GaussNewtonParams()
     steps.setMaxIterations(2)
     # all frames, too, matched again: what is left is due to the frame
-    again = associate([drive], tracks, solution.state, kernel, config.graph)
+    again = associate([drive], motions, solution.state, kernel, config.graph)
 
     def calibrated(pairs: list[PairMatches]) -> np.ndarray:
         graph, values = joint_graph(pairs, solution.state, config.graph, truth)

@@ -54,7 +54,7 @@ def test_progress_names_no_method() -> None:
 
 def _of_drives() -> FitOfDrives:
     problem, _ = _solved()
-    return FitOfDrives(problem.drives, problem.tracks, problem.objects, problem.config.joint.graph)
+    return FitOfDrives(problem.drives, problem.motions, problem.objects, problem.config.joint.graph)
 
 
 def _quality(state: State) -> FitQuality:

@@ -60,7 +60,7 @@ def test_the_score_is_best_at_the_estimate() -> None:
 
 def test_a_profile_is_of_the_score_that_solutions_are_compared_by() -> None:
     problem, solution = problem_by_edges(), solution_by_edges()
-    edges = edges_of(problem.drives, problem.tracks, problem.config.joint.graph)
+    edges = edges_of(problem.drives, problem.motions, problem.config.joint.graph)
     held = np.diag(SIGMAS**2)  # nothing follows
     for profile in score_profiles(edges, solution.state, held, SIGMAS):
         assert profile.best_score is not None

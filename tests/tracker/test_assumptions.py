@@ -25,7 +25,7 @@ from sst_graph.drive.preparation import ImageFeatures, prepare_drive
 from sst_graph.errors import ConfigError
 from sst_graph.experiments.wrong_drives import with_distortion, with_principal_point
 from sst_graph.graph.building import joint_graph
-from sst_graph.graph.matching import Tracks
+from sst_graph.graph.drive_motion import motions_of
 from sst_graph.graph.outer_loop import JointProblem, solve_joint
 from sst_graph.graph.state import State, nuisance_key
 from sst_graph.objects.tracks import object_tracks
@@ -272,7 +272,7 @@ def test_what_is_estimated_agrees_with_the_batch(
         graph=dataclasses.replace(config.noise, lower_edges=estimating.matcher.graph.lower_edges),
     )
     start = State(distorted.truth.cTl, (0.03,))
-    solution = solve_joint(JointProblem([drive], Tracks([drive], [tracks]), joint), start)
+    solution = solve_joint(JointProblem([drive], motions_of([drive], [tracks]), joint), start)
     robust = robust_covariance(solution.graph, solution.values, solution.pairs, solution.state, [tracks])
     state, column = solution.state, robust.unknowns.column(nuisance_key("k1"))
     turn = gtsam.Pose3.Logmap(update.T_camera_lidar.between(state.cTl))

@@ -27,7 +27,6 @@ from sst_graph.graph.state import State
 from sst_graph.hand_eye.graph import camera_steps
 from sst_graph.metrics import calibration_errors
 from sst_graph.result import CalibrationResult, read_result
-from sst_graph.tracker import inputs
 from sst_graph.tracker.by_edges.review import EdgeReview, variance_ratio
 from sst_graph.tracker.estimate import OnlineEstimate
 from sst_graph.tracker.start.first_estimate import FirstEstimate
@@ -116,16 +115,15 @@ def test_labels_are_not_read_by_method_edges() -> None:
     assert set(labelled.inputs.window.images[0].contours) == {OBJECT}
 
 
-def test_images_are_bounded_where_no_scan_comes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(inputs, "_MAX_EDGE_IMAGES", 3)
-    street = simulated(TRACKED_STREET)
+def test_images_are_bounded_where_no_scan_comes() -> None:
+    street = simulated(dataclasses.replace(TRACKED_STREET, frames=1, width=124, height=38))
     tracker = Tracker(street.camera, config("edges"), street.truth.cTl)
     image = without_labels(street[0]).image
     assert image is not None
-    for k in range(6):
+    for k in range(103):
         late = dataclasses.replace(image, stamp_ns=image.stamp_ns + k * 1_000_000)
         tracker.add_image(late)
-    assert len(tracker.inputs.window.images) == 3
+    assert len(tracker.inputs.window.images) == 100
 
 
 def test_the_graph_is_linearized_where_its_matches_were_made() -> None:

@@ -34,7 +34,7 @@ def _begun() -> tuple[bytes, int]:
 def begun(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Frame]]:
     """The checkpoint, and the frames to come."""
     content, seen = stored(("begun", STREET, CONFIG), _begun)
-    path = tmp_path_factory.mktemp("tracker") / "settling.npz"
+    path = tmp_path_factory.mktemp("tracker") / "relinearizing.npz"
     path.write_bytes(content)
     street = simulated(STREET)
     return path, [street[k] for k in range(seen, len(street))]

@@ -15,7 +15,8 @@ from sst_graph.covariance.cluster_robust import robust_covariance
 from sst_graph.errors import DataError, EstimationError
 from sst_graph.factors import FactorError
 from sst_graph.graph.building import joint_graph, state_from
-from sst_graph.graph.matching import Tracks, associate
+from sst_graph.graph.drive_motion import motions_of
+from sst_graph.graph.matching import associate
 from sst_graph.inspect.gained import gained_of
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.result import CalibrationResult
@@ -56,7 +57,7 @@ def test_the_covariance_is_the_batch_s(running: Path) -> None:
     state, config = tracker.estimate.point.state(tracker.matcher.classes), tracker.matcher.graph
     tracks = object_tracks(drive)
     kernel = tracker.matcher.kernel
-    pairs = associate([drive], Tracks([drive], [tracks]), state, kernel, config)
+    pairs = associate([drive], motions_of([drive], [tracks]), state, kernel, config)
     graph, values = joint_graph(pairs, state, config)
     values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     state = state_from(values, state, pairs)

@@ -16,8 +16,9 @@ from sst_graph.covariance.jackknife import ObjectSpread, composed
 from sst_graph.drive.preparation import PrepareConfig, prepare_drive
 from sst_graph.factors import RobustKernel
 from sst_graph.graph.building import joint_graph
+from sst_graph.graph.drive_motion import motions_of
 from sst_graph.graph.linear import unit_scale
-from sst_graph.graph.matching import GraphConfig, Tracks, associate
+from sst_graph.graph.matching import GraphConfig, associate
 from sst_graph.graph.state import EXTRINSIC, State, bias_key, object_bias_key, time_offset_key
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.simulator import SimulationConfig
@@ -47,7 +48,7 @@ def matched() -> tuple[RobustCovariance, Point, list[LinearizedPair]]:
     drive = prepare_drive(street, [VEHICLE], PrepareConfig(use_visual_odometry=False))
     tracks, state = object_tracks(drive), State(street.truth.cTl, (OFFSET_S,))
     kernel = RobustKernel("geman_mcclure", 3.0)
-    pairs = associate([drive], Tracks([drive], [tracks]), state, kernel, CONFIG)
+    pairs = associate([drive], motions_of([drive], [tracks]), state, kernel, CONFIG)
     graph, values = joint_graph(pairs, state, CONFIG)
     robust = robust_covariance(graph, values, pairs, state, [tracks])
     seen = {t: 0 for pair in pairs for t in pair.tracks[VEHICLE].tolist()}

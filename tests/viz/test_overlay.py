@@ -12,7 +12,7 @@ from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.types import CameraImage, Frame, Scan, SemanticClass
 from sst_graph.viz import draw_overlay
-from sst_graph.viz.overlay import CONTOUR, IN_MASK, MIN_WIDTH_PX, NOT_ASKED, OUT_OF_MASK
+from sst_graph.viz.overlay import CONTOUR, IN_MASK, MIN_WIDTH_PX, NOT_MATCHED, OUT_OF_MASK
 
 CAMERA = PinholeCamera(500.0, 500.0, 400.0, 100.0, 800, 200)
 WHERE = gtsam.Pose3()
@@ -63,7 +63,7 @@ def test_the_contour_follows_the_picture_and_is_dark_where_it_shows_nothing() ->
     pixels = frame.image.pixels.copy()
     pixels[80:, 382:421] = 220
     picture = draw_overlay(replace(frame, image=replace(frame.image, pixels=pixels)), CAMERA, WHERE, 0.0)
-    found, dark = _pixels_of(picture, CONTOUR), _pixels_of(picture, NOT_ASKED)
+    found, dark = _pixels_of(picture, CONTOUR), _pixels_of(picture, NOT_MATCHED)
     assert {u for u, v in found if v == 100} == {382, 420}
     assert {u for u, v in dark if v == 120} >= set(range(390, 410)) and not any(v < 110 for _, v in dark)
 

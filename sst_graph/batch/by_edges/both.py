@@ -19,7 +19,7 @@ from sst_graph.covariance.undecided_sweep import MATTERS
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import EstimationError
 from sst_graph.fit import Fit
-from sst_graph.graph.state import State
+from sst_graph.graph.state import State, step_text
 from sst_graph.inspect.frame_information import KEY as FRAME_INFORMATION
 from sst_graph.types import Guess
 
@@ -188,10 +188,8 @@ def _assumptions(fused: Fused, labels: MethodEstimate, edges: MethodEstimate) ->
 def _contradiction(fused: Fused) -> tuple[str, ...]:
     if fused.chi2 <= MAX_DISAGREEMENT_CHI2:
         return ()
-    degrees, metres = (float(np.linalg.norm(fused.step[own])) for own in (slice(0, 3), slice(3, 6)))
     return (
-        f"labels and edges of different frames contradict each other: {np.degrees(degrees):.2f} deg, "
-        f"{100.0 * metres:.1f} cm and {1e3 * fused.step[6]:+.1f} ms apart "
+        f"labels and edges of different frames contradict each other: {step_text(fused.step)} apart "
         f"(chi-squared {fused.chi2:.0f} of 7)",
     )
 

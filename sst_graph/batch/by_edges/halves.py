@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from sst_graph.batch.by_edges.covariance import SAMPLES
+from sst_graph.batch.by_edges.optimum import SCORE_PX, START_KERNELS_PX
 from sst_graph.batch.by_edges.reasons import MIN_OVER_OTHER
 from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX
 from sst_graph.batch.contradictions import FALSE_ALARM
@@ -33,9 +34,7 @@ _SEARCHED_SCANS = 12
 """Scans of a half on which starts are compared."""
 _HALF_DEG = 5.0
 """A half's own pose is searched within this of the estimate, about each of the camera's axes [deg]."""
-_SCORE_PX = 1.5
-"""Blur under which solutions are compared [px]."""
-KERNELS_PX = (10.0, 8.0, 6.0, 5.0, 4.0, 3.0, 2.0, 1.5, 1.2)
+_KERNELS_PX = (*START_KERNELS_PX, 2.0, 1.5, 1.2)
 """Scales of the kernel of a half's solution [px]: from a start that is a degree off."""
 
 
@@ -71,10 +70,10 @@ def _half(
     """A half's own estimate, as a step from that of the whole; None where it has none."""
     if len(scans) < _LEAST_SCANS:
         return None
-    drive, tracks = problem.drives[number].part(scans), problem.tracks.part(number, scans)
+    drive, motion = problem.drives[number].part(scans), problem.motions[number].part(scans)
     few = evenly_spread(range(len(scans)), _SEARCHED_SCANS)
-    some = replace(problem, drives=[drive.part(few)], tracks=tracks.part(0, few))
-    edges = edges_of(some.drives, some.tracks, problem.config.graph)
+    some = replace(problem, drives=[drive.part(few)], motions=[motion.part(few)])
+    edges = edges_of(some.drives, some.motions, problem.config.graph)
     if not edges:
         return None
     # 1. Every start on a few scans.
@@ -84,17 +83,17 @@ def _half(
     found: list[tuple[float, State]] = []
     for start in starts:
         try:
-            own = solve_joint(some, start, KERNELS_PX).state
+            own = solve_joint(some, start, _KERNELS_PX).state
         except EstimationError:
             continue
         # From another start a pose must agree clearly better, as between the optima of a whole drive.
-        found.append((score(edges, own, _SCORE_PX) * (1.0 if start is state else 1.0 / MIN_OVER_OTHER), own))
+        found.append((score(edges, own, SCORE_PX) * (1.0 if start is state else 1.0 / MIN_OVER_OTHER), own))
     if not found:
         return None
     # 2. The best of them on all.
     best = max(found, key=lambda one: one[0])[1]
     try:
-        best = solve_joint(replace(problem, drives=[drive], tracks=tracks), best, NEAR_KERNELS_PX).state
+        best = solve_joint(replace(problem, drives=[drive], motions=[motion]), best, NEAR_KERNELS_PX).state
     except EstimationError:
         return None
     return PartEstimate(difference(state, best), 2.0 * covariance, float(SAMPLES))

@@ -40,7 +40,7 @@ from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.known import motion_steps
 from sst_graph.graph.matching import edges_of, match_all
 from sst_graph.graph.outer_loop import JointProblem, support_of
-from sst_graph.graph.state import State, difference
+from sst_graph.graph.state import State, difference, step_text
 from sst_graph.objects.tracks import ObjectId
 from sst_graph.stepwise import Stepwise, run_to_end
 from sst_graph.types import FloatArray, Guess
@@ -102,11 +102,9 @@ class LensTest:
             return ()
         assert self.step is not None
         figures = ", ".join(each.assumption.figure(each.value, each.sigma) for each in self.contradicted)
-        degrees, metres = (float(np.linalg.norm(self.step[own])) for own in (slice(0, 3), slice(3, 6)))
         return (
             f"the lens is a little off, and the sigmas cover it: {figures}; with the lens free the "
-            f"estimate moves by {np.degrees(degrees):.2f} deg, {100.0 * metres:.1f} cm and "
-            f"{1e3 * self.step[6]:+.1f} ms",
+            f"estimate moves by {step_text(self.step)}",
         )
 
     def _matters(self, covariance: FloatArray) -> bool:
@@ -193,7 +191,7 @@ def _near(problem: JointProblem, start: State) -> Stepwise[State]:
 def _support(problem: JointProblem, *states: State) -> list[float]:
     """How many edges are met at each state, by their robust weights."""
     kernel = RobustKernel("geman_mcclure", NEAR_KERNELS_PX[-1])
-    edges = edges_of(problem.drives, problem.tracks, problem.config.graph)
+    edges = edges_of(problem.drives, problem.motions, problem.config.graph)
     return [sum(support_of(match_all(edges, state, kernel), state).values()) for state in states]
 
 

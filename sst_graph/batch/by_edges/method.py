@@ -86,16 +86,19 @@ def edges_method(
     matched = replace(calibration, drives=problem.whole.drives)
     fit = fit_of_edges(matched, (*first, solution), covariance)
     return MethodEstimate(
-        solution.state.cTl,
-        solution.state.time_offsets_s[0],
-        covariance,
-        frames_used(drives, solution),
-        (*with_lens_reasons(reasons, lens_reasons, contrast), *own.reasons),
-        remarks,
+        cTl=solution.state.cTl,
+        time_offset_s=solution.state.time_offsets_s[0],
+        covariance=covariance,
+        frames=frames_used(drives, solution),
+        reasons=(*with_lens_reasons(reasons, lens_reasons, contrast), *own.reasons),
+        remarks=remarks,
         by_static_objects=covariance,
-        diagnostics=_diagnostics(solution, contrast, motion)
-        | {"spread": {**own.sigmas, "farther_edges": np.abs(farther_step).tolist()}}
-        | {"assumptions": dict(own.assumptions), "estimated": dict(own.estimated)},
+        diagnostics={
+            **_diagnostics(solution, contrast, motion),
+            "spread": {**own.sigmas, "farther_edges": np.abs(farther_step).tolist()},
+            "assumptions": dict(own.assumptions),
+            "estimated": dict(own.estimated),
+        },
         fit=fit,
         matched=MatchedDrives(matched, solution.state),
         by_sweeps=sweeps.covariance,

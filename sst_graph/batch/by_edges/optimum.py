@@ -136,7 +136,7 @@ def _newton_ascent(
     to the peak of its edge, which Newton's method says, until the score gains too little to count."""
     graph = replace(problem.config.graph, edge_place="peak")
     by_peaks = replace(problem, config=replace(problem.config, graph=graph))
-    edges = edges_of(problem.drives, problem.tracks, graph)
+    edges = edges_of(problem.drives, problem.motions, graph)
     state, found_score = start, 0.0
     for _ in range(_MAX_ROUNDS):
         solution = yield from solution_steps(by_peaks, state, NEAR_KERNELS_PX, progress)

@@ -21,6 +21,7 @@ POSITIONS = ("upward", "to_the_right", "outward")
 """All upper edges lie higher, all at the sides farther to the right, or farther out. One unit is the
 deviation of a match by the spacing of its beams."""
 _LEFT, _RIGHT = 0, 1
+"""Sides, as matches number them."""
 
 
 def considered_positions(estimate: JointEstimate, config: MatchConfig) -> Considered:

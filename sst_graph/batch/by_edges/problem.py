@@ -16,14 +16,15 @@ from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.drive.edges_of_frames import with_edges
 from sst_graph.drive.preparation import Drive, PrepareConfig, Progress
-from sst_graph.edges.search import KnownRotation, SearchRegion, angle_deg
+from sst_graph.edges.search import KnownRotation, SearchRegion
 from sst_graph.errors import EstimationError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.graph.known import KnownCalibration, motion_steps
-from sst_graph.graph.matching import DriveEdges, Tracks, edges_of
+from sst_graph.graph.matching import DriveEdges, edges_of
 from sst_graph.graph.outer_loop import JointProblem
 from sst_graph.graph.state import State, difference
 from sst_graph.hand_eye.solution import MotionSolution, alternative, solve_motion
+from sst_graph.metrics import turn_rad
 from sst_graph.sampling import evenly_spread
 from sst_graph.types import FloatArray, Guess
 
@@ -74,7 +75,7 @@ class EdgesProblem:
     @cached_property
     def subset_edges(self) -> list[DriveEdges]:
         """Boundary points of the few scans."""
-        return edges_of(self.some.drives, self.some.tracks, self.some.config.graph)
+        return edges_of(self.some.drives, self.some.motions, self.some.config.graph)
 
 
 @dataclass(frozen=True)
@@ -103,7 +104,7 @@ def motion_alone(
         one
         for one in solutions
         if abs(one.state.time_offsets_s[0] - guess.time_offset_s) <= reach_s
-        and (guess.cTl is None or angle_deg(one.state.cTl, guess.cTl) < _MOST_DEG)
+        and (guess.cTl is None or np.degrees(turn_rad(one.state.cTl, guess.cTl)) < _MOST_DEG)
     ]
     if not possible or not possible[0].converged or alternative(possible) is not None:
         return None
@@ -196,8 +197,8 @@ def edges_problem(
     whole = replace(joint, centre=centre, prior=known)
     scans = [_some_scans(drive, guess.time_offset_s) for drive in drives]
     parts = [drive.part(own) for drive, own in zip(drives, scans, strict=True)]
-    tracks = [joint.tracks.part(number, own) for number, own in enumerate(scans)]
-    some = replace(whole, drives=parts, tracks=Tracks.joined(tracks))
+    motions = [motion.part(own) for motion, own in zip(joint.motions, scans, strict=True)]
+    some = replace(whole, drives=parts, motions=motions)
     return EdgesProblem(whole, some, replace(region, cTl=pose), centre, known)
 
 

@@ -9,13 +9,12 @@ import gtsam
 import numpy as np
 
 from sst_graph.edges.agreement import score
-from sst_graph.edges.search import angle_deg
 from sst_graph.edges.turns import turned_states
-from sst_graph.errors import count_of
 from sst_graph.graph.matching import DriveEdges
-from sst_graph.graph.outer_loop import JointSolution
-from sst_graph.graph.state import State, difference
+from sst_graph.graph.outer_loop import JointSolution, still_moved
+from sst_graph.graph.state import State, difference, step_text
 from sst_graph.hand_eye.solution import MotionSolution
+from sst_graph.metrics import turn_rad
 from sst_graph.stepwise import Stepwise, run_to_end
 from sst_graph.types import FloatArray
 
@@ -79,7 +78,7 @@ def edge_contrast_steps(
         around.append(score(edges, turned_state, BLUR_PX))
         yield SCORE_WORK
     own = score(edges, state, BLUR_PX)
-    apart = [each for each in others if angle_deg(each.cTl, state.cTl) > _APART_DEG]
+    apart = [each for each in others if np.degrees(turn_rad(each.cTl, state.cTl)) > _APART_DEG]
     other = max((score(edges, each, BLUR_PX) for each in apart), default=0.0)
     yield SCORE_WORK * (1 + len(apart))
     return contrast_of(own, around, other)
@@ -101,8 +100,7 @@ def unsettled_reasons(step: FloatArray) -> tuple[str, ...]:
         return ()
     return (
         "solved again with edges farther away, and from there with near ones, the estimate ends "
-        f"{np.degrees(np.linalg.norm(step[:3])):.2f} deg, {100.0 * np.linalg.norm(step[3:6]):.1f} cm and "
-        f"{1e3 * step[6]:+.1f} ms away: it has not settled on one set of edges",
+        f"{step_text(step)} away: it has not settled on one set of edges",
     )
 
 
@@ -116,16 +114,17 @@ def edges_reasons(
     """Why the estimate may be wrong altogether; none where nothing says so."""
     reasons = []
     if not solution.converged:
-        reasons.append(f"the outer loop still moved after {count_of(solution.outer_iterations, 'iteration')}")
+        reasons.append(still_moved(solution.outer_iterations))
     reasons += contrast_reasons(contrast)
     if motion is not None:
         step = difference(motion.state, solution.state)[[0, 1, 2, 6]]
         total = (motion.covariance + covariance)[np.ix_([0, 1, 2, 6], [0, 1, 2, 6])] + np.diag(_FLOOR**2)
         chi2 = float(step @ np.linalg.solve(total, step))
         if chi2 > MAX_MOTION_CHI2:
+            why = "" if motion.misfit is None else f" ({motion.misfit})"
             reasons.append(
                 f"motion alone gives another calibration, {np.degrees(np.linalg.norm(step[:3])):.2f} deg and "
-                f"{1e3 * step[3]:+.1f} ms away (chi-squared {chi2:.0f} of 4)" + motion.doubt
+                f"{1e3 * step[3]:+.1f} ms away (chi-squared {chi2:.0f} of 4){why}"
             )
     return (*reasons, *far_reasons(solution.state.cTl, centre.cTl))
 

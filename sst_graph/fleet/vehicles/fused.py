@@ -47,8 +47,8 @@ class Change:
     def words(self) -> str:
         """One sentence for people."""
         dates = f" ({self.since[:10]} to {self.until[:10]})" if self.since and self.until else ""
-        doubt = "" if min(self.drives) > 1 else "; only one drive on a side, which may be wrong itself"
-        return f"between {self.after} and {self.before}{dates}: {self.finding.words}{doubt}"
+        caveat = "" if min(self.drives) > 1 else "; only one drive on a side, which may be wrong itself"
+        return f"between {self.after} and {self.before}{dates}: {self.finding.words}{caveat}"
 
 
 @dataclass(frozen=True)

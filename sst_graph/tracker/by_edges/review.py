@@ -26,7 +26,7 @@ from sst_graph.batch.by_edges.optimum import farther_edges_steps
 from sst_graph.batch.by_edges.reasons import contrast_reasons, edge_contrast_steps, far_reasons
 from sst_graph.covariance.shared_errors import spread_covariance
 from sst_graph.graph.known import KnownCalibration
-from sst_graph.graph.matching import Tracks, edges_of
+from sst_graph.graph.matching import edges_of
 from sst_graph.graph.outer_loop import JointProblem
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import ObjectId
@@ -83,7 +83,7 @@ def review_steps(
     """
     drive = problem.drives[0]
     few = evenly_spread(range(len(drive.scans)), _SCANS)
-    edges = edges_of([drive.part(few)], problem.tracks.part(0, few), problem.config.graph)
+    edges = edges_of([drive.part(few)], [problem.motions[0].part(few)], problem.config.graph)
     contrast = yield from edge_contrast_steps(edges, state, [], seed)
     step, unsettled = yield from farther_edges_steps(problem, state)
     halves, _ = yield from half_sample_steps(problem, state, [dict(objects)])
@@ -123,8 +123,8 @@ class Review(SpreadWork[EdgeReview]):
 
     def steps(self) -> Stepwise[EdgeReview]:
         drive, calibration = of_kind(self.stretch.drive, edges=True), self.config.calibration
-        tracks = Tracks([drive]).with_objects(self.stretch.tracks, self.stretch.dynamic)
-        problem = JointProblem([drive], tracks, calibration.joint, self.known.state, self.known)
+        motion = self.stretch.motion(drive)
+        problem = JointProblem([drive], [motion], calibration.joint, self.known.state, self.known)
         return review_steps(problem, self.state, self.stretch.tracks, calibration.seed)
 
 

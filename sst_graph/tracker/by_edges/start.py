@@ -12,7 +12,6 @@ from sst_graph.batch.by_edges.problem import LabelEstimate, checking_motion, edg
 from sst_graph.batch.by_edges.reasons import edge_contrast_steps, edges_reasons
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.errors import EstimationError
-from sst_graph.graph.matching import Tracks
 from sst_graph.stepwise import Stepwise
 from sst_graph.tracker.by_edges.review import EdgeReview, review_steps
 from sst_graph.tracker.config import TrackerConfig
@@ -39,8 +38,7 @@ def first_edge_estimate_steps(
     motion = motion_alone([drive], guess, calibration, None)
     yield _MOTION_WORK
     # 2. Starts by a search, refined; the best optimum.
-    tracks = Tracks([drive]).with_objects(stretch.tracks, stretch.dynamic)
-    whole = CalibrationProblem([drive], tracks, [dict(stretch.tracks)], guess, calibration)
+    whole = CalibrationProblem([drive], [stretch.motion(drive)], [dict(stretch.tracks)], guess, calibration)
     problem = edges_problem(whole, motion, LabelEstimate())
     starts = yield from starts_steps(problem)
     candidates = yield from refined_steps(problem, starts)

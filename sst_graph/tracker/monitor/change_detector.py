@@ -248,7 +248,7 @@ class ChangeDetector:
 
         whole = compared()
         shown = np.zeros(3, bool) if whole is None else self.statistic.detectable(whole, tried)
-        for track in sorted(self.matcher.objects_of(pairs).difference(out)):
+        for track in sorted(self.matcher.tracks_of(pairs).difference(out)):
             others = compared(track)
             if others is None or self.statistic.normalized(others) > threshold:
                 continue
@@ -295,7 +295,7 @@ class ChangeDetector:
         self._latest.extend((self._before[-1], score) for score in scores)
         # 3. Keep the reference, or discard it.
         if self.statistic.exceeded > self.max_pending:
-            self.confirmation.unreliable |= self.matcher.objects_of(self.scans) - self._moving
+            self.confirmation.unreliable |= self.matcher.tracks_of(self.scans) - self._moving
             self.restart()
         elif not self.statistic.exceeded:
             self.reference = None
@@ -417,7 +417,7 @@ class ChangeDetector:
 
         They must do so with any one object left out, too. Where a single object contradicts, its labels may
         be wrong: with one object in view, or one of dominant weight, it must do so for longer and far above
-            the threshold.
+        the threshold.
         """
         scans = [scan for scan in self.scans if scan >= reference.scan]
         pairs = self.matcher.pairs_at(reference.point, scans, _KERNEL)
@@ -433,5 +433,5 @@ class ChangeDetector:
         if more >= 1.0 and whole > _SINGLE_OBJECT_FACTOR * threshold:
             return True
         least = max(threshold, _LEAST_SHARE_OF_OTHERS * whole)
-        objects = self.matcher.objects_of(scans) - self._moving
+        objects = self.matcher.tracks_of(scans) - self._moving
         return whole > least and all(value(track) > least for track in objects)

@@ -30,6 +30,7 @@ _SHARE = 0.5
 _TURNS_RAD = np.radians([0.5, 1.0])
 """Turns about the camera's x and y axis, both ways; the wide kernel reaches from each to the next [rad]."""
 _AXES = np.array([s * turn * axis for turn in _TURNS_RAD for axis in np.eye(3)[:2] for s in (1.0, -1.0)])
+"""(8, 3) rotation vectors of these turns [rad]."""
 
 
 def turned(point: Point, rotation: FloatArray) -> Point:

@@ -18,7 +18,8 @@ from sst_graph.graph.building import (
     PRIOR_ROTATION_SIGMA_RAD,
     PRIOR_TRANSLATION_SIGMA_M,
 )
-from sst_graph.graph.matching import GraphConfig, Tracks, associate
+from sst_graph.graph.drive_motion import DriveMotion
+from sst_graph.graph.matching import GraphConfig, associate
 from sst_graph.graph.outer_loop import (
     KERNELS_PX,
     MIN_EXPLAINED,
@@ -30,7 +31,8 @@ from sst_graph.graph.outer_loop import (
 )
 from sst_graph.graph.state import State
 from sst_graph.initialization.candidates import StartProblem
-from sst_graph.initialization.selection import select_start_steps, turn_rad
+from sst_graph.initialization.selection import select_start_steps
+from sst_graph.metrics import turn_rad
 from sst_graph.stepwise import Stepwise
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.start.first_estimate import FirstEstimate, StartGuess
@@ -70,13 +72,13 @@ class _Problem:
 
     Attributes:
         drive: the scans and images.
-        tracks: their twists, without objects.
+        motion: of the LiDAR.
         joint: the joint method over them, its time offset damped.
         config: settings.
     """
 
     drive: Drive
-    tracks: Tracks
+    motion: DriveMotion
     joint: JointProblem
     config: TrackerConfig
 
@@ -102,15 +104,15 @@ def first_estimate_steps(drive: Drive, guess: StartGuess, config: TrackerConfig)
     """
     searched = guess.search or guess.cTl is None
     reach = config.calibration.search.time_offset_s if guess.search else 0.0
-    tracks = Tracks([drive])
+    motion = DriveMotion.of(drive)
     # 1. Candidates, with time offsets around the guess's.
-    starts = yield from _starts(drive, tracks, guess, config, reach)
+    starts = yield from _starts(drive, motion, guess, config, reach)
     # 2. Solutions from their poses with the guess's time offset, and from the candidates as they are.
     held = [State(start.cTl, (guess.time_offset_s,)) for start in _one_of_each_basin(starts)]
     # After a search the starts are near.
     kernels_px = NARROW_KERNELS_PX if searched else KERNELS_PX
     families = [held, starts] if reach > 0.0 else [starts]
-    problem = _Problem(drive, tracks, JointProblem.of([drive], _damped(config)), config)
+    problem = _Problem(drive, motion, JointProblem.of([drive], _damped(config)), config)
     yield _TRACKS_WORK
     solved, failed = yield from _all_of([_best(problem, each, kernels_px) for each in families])
     if not solved:
@@ -183,7 +185,7 @@ def _best(problem: _Problem, starts: Sequence[State], kernels_px: Sequence[float
 
 
 def _starts(
-    drive: Drive, tracks: Tracks, guess: StartGuess, config: TrackerConfig, reach_s: float
+    drive: Drive, motion: DriveMotion, guess: StartGuess, config: TrackerConfig, reach_s: float
 ) -> Stepwise[list[State]]:
     """Where the solutions begin: the candidates that the batch's selection keeps, with offsets within
     ``reach_s`` of the guess's, or the guess itself.
@@ -195,7 +197,7 @@ def _starts(
     enabled = guess.search or guess.cTl is None
     search = dataclasses.replace(calibration.search, time_offset_s=reach_s, enabled=enabled)
     joint = _damped(config) if reach_s == 0.0 else calibration.joint
-    problem = StartProblem([drive], tracks, calibration.classes, guess)
+    problem = StartProblem([drive], [motion], calibration.classes, guess)
     selection = yield from select_start_steps(problem, joint.graph, search)
     return [State(cTl, (time_offset_s,)) for cTl, time_offset_s in selection.starts]
 
@@ -230,7 +232,7 @@ def _cost(problem: _Problem, point: Point) -> float:
     """Mean cost of all boundary points of the window."""
     graph, classes = problem.config.calibration.noise, problem.config.calibration.classes
     kernel = RobustKernel("geman_mcclure", KERNELS_PX[-1])
-    pairs = associate([problem.drive], problem.tracks, point.state(classes), kernel, graph)
+    pairs = associate([problem.drive], [problem.motion], point.state(classes), kernel, graph)
     scans, below = problem.drive.scans, graph.lower_edges
     counted = [(pair, boundary_count(scans[pair.pair.scan], below)) for pair in pairs]
     cost = mean_cost(counted, point, classes, kernel)

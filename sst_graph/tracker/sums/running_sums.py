@@ -17,10 +17,9 @@ from sst_graph.covariance.sums import ScoreSums, total
 from sst_graph.tracker.sums.linearized_pair import LinearizedPair
 from sst_graph.tracker.sums.object_sums import ObjectSums
 from sst_graph.tracker.window.gaussian import with_room
+from sst_graph.tracker.window.window import OBJECT_MEMORY
 from sst_graph.types import FloatArray, IntArray
 
-_MEMORY = 50
-"""A side that was not seen in so many scans is closed: objects are forgotten after as many."""
 _RECENT = 150
 """The error model is fitted to so many of the latest frames and to those of the window."""
 
@@ -66,7 +65,7 @@ class RunningSums:
         n = self.size + self.held
         both = self.scores, pair.scores.columns(slice(len(columns)))
         self.last_seen.update(dict.fromkeys(pair.scores.sides.tolist(), scan))
-        closed = [side for side, last in self.last_seen.items() if last < scan - _MEMORY]
+        closed = [side for side, last in self.last_seen.items() if last < scan - OBJECT_MEMORY]
         for side in closed:
             del self.last_seen[side]
         self.scores = total(n, both, (np.arange(n), columns)).without_sides(closed)

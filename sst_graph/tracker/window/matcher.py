@@ -16,11 +16,11 @@ from sst_graph.drive.twists import GrowingTwists
 from sst_graph.factors import alignment_cost
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.features.mask_contour import ContourMap
+from sst_graph.graph.drive_motion import DriveMotion
 from sst_graph.graph.matching import (
     DYNAMIC_REACH_M,
     GraphConfig,
     PairMatches,
-    Tracks,
     associate,
 )
 from sst_graph.graph.outer_loop import KERNELS_PX
@@ -62,13 +62,13 @@ class WindowMatcher:
         self.graph = config.calibration.noise
         self.held_names = held_names(self.graph.estimate, self.classes)
         self.kernel = RobustKernel("geman_mcclure", KERNELS_PX[-1])
-        self._twists: tuple[int, Tracks] | None = None
+        self._motion: tuple[int, DriveMotion] | None = None
         self._growing = GrowingTwists(_SMOOTHED)
         self._last: tuple[Point, dict[int, PairMatches]] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the cache for the present frame."""
-        return {**vars(self), "_twists": None, "_last": None}
+        return {**vars(self), "_motion": None, "_last": None}
 
     def check_lower_edges(self, point: Point) -> None:
         """Match lower edges from now on, of classes whose labels agree about them."""
@@ -78,10 +78,10 @@ class WindowMatcher:
     def lower_edge_support(self, point: Point, chosen: Collection[int] | None) -> LowerEdgeSupport:
         """How well the labels agree with the lower edges of some scans (None: all) at a point."""
         drive, numbers = self.window.drive(None if chosen is None else chosen.__contains__)
-        tracks, state = self._tracks(drive, numbers), point.state(self.classes)
+        motion, state = self._motion_of(drive, numbers), point.state(self.classes)
         if by_edges(self.classes):
             drive = of_kind(drive, edges=False)
-        return lower_edge_support([drive], tracks, state, self.config.calibration.joint)
+        return lower_edge_support([drive], [motion], state, self.config.calibration.joint)
 
     def set_lower_edges(self, support: LowerEdgeSupport) -> None:
         """Match lower edges from now on, of classes whose labels agree by this support."""
@@ -170,7 +170,7 @@ class WindowMatcher:
         """The dynamic objects of a scan whose weight is lower with the image of a pair, or 0."""
         return self.window.left_out(number, time_offset_s + pair.pair.base_tau_s, DYNAMIC_REACH_M)
 
-    def objects_of(self, chosen: Collection[int]) -> set[int]:
+    def tracks_of(self, chosen: Collection[int]) -> set[int]:
         """Tracks of all objects of some scans."""
         return {track for number in chosen for track in self.window.tracks.get(number, {}).values()}
 
@@ -207,9 +207,9 @@ class WindowMatcher:
     ) -> tuple[dict[int, PairMatches], list[int]]:
         part, numbers = self.window.drive(None if chosen is None else chosen.__contains__)
         state = point.state(self.classes)
-        tracks, pairs = self._tracks(part, numbers), list[PairMatches]()
+        motion, pairs = self._motion_of(part, numbers), list[PairMatches]()
         for drive, own_kernel, graph in self._by_kind(part, kernel):
-            pairs += associate([drive], tracks, state, own_kernel, graph)
+            pairs += associate([drive], [motion], state, own_kernel, graph)
         return {numbers[pair.pair.scan]: pair for pair in pairs}, numbers
 
     def _by_kind(
@@ -241,16 +241,15 @@ class WindowMatcher:
         columns = PairColumns(self.classes, self.window.tracks[number], held, self.graph)
         return linearize_pair(pair, point, columns, share, by_object)
 
-    def _tracks(self, part: Drive, numbers: list[int]) -> Tracks:
-        """Twists over the window's motions, made once a scan, and objects where they have biases."""
-        if self._twists is None or self._twists[0] != self.window.next_scan:
-            self._twists = (self.window.next_scan, Tracks([part], growing=self._growing))
-        twists = self._twists[1]
-        return (
-            twists.with_objects(*self.window.objects_of(numbers), self.window.poses_of(numbers))
-            if self.graph.object_bias_sigma_px > 0.0
-            else twists
-        )
+    def _motion_of(self, part: Drive, numbers: list[int]) -> DriveMotion:
+        """Of the LiDAR, made once a scan, and of the objects where they have biases."""
+        if self._motion is None or self._motion[0] != self.window.next_scan:
+            self._motion = (self.window.next_scan, DriveMotion(self._growing.of(part.lidar_motions)))
+        motion = self._motion[1]
+        if self.graph.object_bias_sigma_px == 0.0:
+            return motion
+        posed = replace(motion, poses=self.window.poses_of(numbers))
+        return posed.with_objects(*self.window.objects_of(numbers))
 
 
 def mean_cost(

@@ -16,7 +16,7 @@ from sst_graph.batch.by_edges.optimum import CONVERGED_STEP
 from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX
 from sst_graph.batch.lower_edges import LowerEdgeSupport
 from sst_graph.factors.robust import RobustKernel
-from sst_graph.graph.outer_loop import NARROW_KERNELS_PX, step_share
+from sst_graph.graph.outer_loop import INNER_ITERATIONS, NARROW_KERNELS_PX, step_share
 from sst_graph.tracker.by_edges.kinds import by_edges
 from sst_graph.tracker.window.gaussian import Point, core_steps, inverted
 from sst_graph.tracker.window.matcher import WindowMatcher
@@ -27,8 +27,6 @@ _CONVERGED_SIGMAS = 0.02
 """A step of matching and solving that is shorter, in standard deviations, has converged."""
 _EDGE_STEP = CONVERGED_STEP / len(NEAR_KERNELS_PX)
 """(7,) the same where edges are aligned, a part of what a round of scales may move by [rad, m, s]."""
-_INNER = 2
-"""Steps of the optimisation on frozen matches, as in the batch: the next matches change it anyway."""
 SCANS = 5
 """Scans matched with each frame while the window is matched again: more make these frames slower."""
 _PASSES = 2
@@ -111,7 +109,7 @@ def relinearize_window(
             break
         at = window.point.moved(step_share(last) * step)
     smoother.update(found, missing, 0, alive)
-    smoother.optimize(_INNER)
+    smoother.optimize(INNER_ITERATIONS)
     if not converged:
         smoother.point = at
     return converged

@@ -47,6 +47,8 @@ _RELINEARIZE = {
 
 _RELINEARIZE_SPANS = 1e-3
 """The same of an assumption's parameter, in units of what it may be: a few hundredths of a pixel."""
+_SHORTEST_S = 1e-3
+"""Least time between two epochs, so that their random walk has a variance [s]."""
 
 
 def _parameters(estimate: Sequence[str]) -> gtsam.ISAM2Params:
@@ -272,9 +274,10 @@ class WindowSmoother:
             values.insert(key, value)
         self._replace_isam(*self._linearized(values))
 
-    def walk(self, seconds: float) -> FloatArray:
-        """(m,) variances of the random walk of [extrinsic, offset, biases, parameters] over some seconds."""
-        drift = self.drift
+    def walk(self, old: Epoch | RetiredEpoch, new: Epoch | RetiredEpoch) -> FloatArray:
+        """(m,) variances of the random walk of [extrinsic, offset, biases, parameters] from one epoch to the
+        next."""
+        drift, seconds = self.drift, max(_SHORTEST_S, (new.start_ns - old.start_ns) * 1e-9)
         rates = [np.radians(drift.rotation_deg)] * 3 + [drift.translation_m] * 3 + [drift.time_offset_s]
         return np.asarray(seconds * np.square([*rates, *[0.0] * (self.prior.point.core_size - 7)]))
 
@@ -304,7 +307,7 @@ class WindowSmoother:
         total, numbers = past, {scan: self._epoch_of(scan, pair) for scan, pair in pairs.items()}
         for i, epoch in enumerate(self.epochs):
             if i > 0:
-                total = total.drifted(self.walk(self._seconds(i)))
+                total = total.drifted(self.walk(self.epochs[i - 1], epoch))
             seen = [pair.linear.information for scan, pair in pairs.items() if numbers[scan] == epoch.number]
             total = Gaussian(total.point, total.information_with(seen), total.vector_with(seen))
         return total
@@ -329,14 +332,10 @@ class WindowSmoother:
         total = past
         for i, epoch in enumerate(self.epochs):
             if i > 0:
-                total = total.drifted(self.walk(self._seconds(i)))
+                total = total.drifted(self.walk(self.epochs[i - 1], epoch))
             seen = [window[scan] for scan, e in self.entries.items() if e.epoch == epoch.number]
             total = replace(total, information=total.information_with(seen))
         return total.information
-
-    def _seconds(self, i: int) -> float:
-        """From the start of epoch i - 1 to that of epoch i [s]."""
-        return max(1e-3, (self.epochs[i].start_ns - self.epochs[i - 1].start_ns) * 1e-9)
 
     def covariance(self, information: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(n, n) cluster-robust covariance of the unknowns of ``past``, and that of independent matches.

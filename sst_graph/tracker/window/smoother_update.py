@@ -223,7 +223,7 @@ class SmootherUpdate:
         """The past moves on to the next epoch by the random walk."""
         smoother = self._smoother
         old, new = self.epochs[0], self.epochs[1]
-        variances = smoother.walk(max(1e-3, (new.start_ns - old.start_ns) * 1e-9))
+        variances = smoother.walk(old, new)
         self.retired.append(self.epoch_sums.retired(old.start_ns, smoother.model))
         self.epoch_sums = EpochSums.empty(self.past.point)
         self.sums.transform(self.past.transition(variances))

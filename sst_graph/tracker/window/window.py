@@ -14,6 +14,7 @@ from sst_graph.batch.by_edges.problem import POINTS_A_SCAN
 from sst_graph.drive.preparation import Drive, ImageFeatures, ScanFeatures
 from sst_graph.errors import DataError, count_of
 from sst_graph.factors.camera import PinholeCamera
+from sst_graph.graph.drive_motion import DriveMotion
 from sst_graph.objects.dynamic_objects import DynamicObject, DynamicObjectTest, dynamic_object_weights
 from sst_graph.objects.occupancy import ObjectName
 from sst_graph.objects.tracks import ObjectId, ObjectTracker
@@ -24,7 +25,7 @@ from sst_graph.types import RelativeMotion, SemanticClass
 FARTHEST_NS = 86_400 * 10**9
 """A stamp that is farther ahead of the one before is an error, not a pause: a day [ns]."""
 OBJECT_MEMORY = 50
-"""Scans after which an object that was not seen again is another one."""
+"""Scans after which an object that was not seen again is another one, and its sides are closed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +43,10 @@ class Stretch:
     tracks: Mapping[ObjectId, int]
     dynamic: Mapping[ObjectId, DynamicObject]
     at_end: bool = False
+
+    def motion(self, drive: Drive) -> DriveMotion:
+        """Of the LiDAR and the objects; drive: this one, with some of its boundary points."""
+        return DriveMotion.of(drive).with_objects(self.tracks, self.dynamic)
 
 
 class Window:

@@ -93,7 +93,7 @@ def test_labels_and_edges_are_of_different_pairs() -> None:
     for drive, c in ((by_labels, VEHICLE), (by_edges, OBJECT)):
         problem = CalibrationProblem.of([drive], Guess(state.cTl), CalibrationConfig())
         joint = problem.joint()
-        edges = edges_of([drive], joint.tracks, joint.config.graph)
+        edges = edges_of([drive], joint.motions, joint.config.graph)
         (matches,) = match_all(edges, state, RobustKernel("geman_mcclure", 5.0))
         assert set(matches.classes) == {c}
         found.append({(matches.pairs[p].scan, matches.pairs[p].image) for p in matches.paired})

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from sst_graph.errors import ConfigError, DataError, EstimationError, SstGraphError
-from sst_graph.experiments.tasks import resumable
+from sst_graph.experiments.tasks.code_version import recorded_version
 from sst_graph.experiments.tasks.resumable import Work, rows_of
 
 RUNS: list[int] = []
@@ -56,15 +56,14 @@ def test_only_what_is_not_done_is_run(tmp_path: Path) -> None:
 
 
 def test_what_another_version_of_the_code_did_is_done_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A table names one version; rows of another may have other fields."""
     RUNS.clear()
     path = tmp_path / "records"
-    monkeypatch.setattr(resumable, "recorded_version", lambda: "commit a")
     run(path, 2, 3, 4)
-    path.write_text(path.read_text().replace('"value": 4.0', '"older": 4.0'))
-    monkeypatch.setattr(resumable, "recorded_version", lambda: "commit b")
+    older = path.read_text().replace(json.dumps(recorded_version()), '"commit a"')
+    path.write_text(older.replace('"value": 4.0', '"older": 4.0'))
     with caplog.at_level(logging.WARNING):
         assert run(path, 2, 3) == [Row(4.0, "2"), Row(9.0, "3")]
     assert RUNS == [2, 3, 4, 2, 3]
