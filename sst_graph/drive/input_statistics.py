@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import cv2
@@ -22,6 +22,8 @@ from sst_graph.types import CameraImage, FloatArray, Frame, Scan, SemanticClass
 
 _SCANS, _IMAGES = 12, 12
 """Scans and images with the expensive statistics (geometry, contours), spread over the drive."""
+_CLOUDS = 3
+"""Scans of which points are kept, about."""
 _LEAST_POINTS = 200
 """Labelled points of the ground from which a plane is fitted; points of a scan whose rounding is told."""
 _RESOLUTION = 1e-6
@@ -74,7 +76,7 @@ class ScanStatistics:
             one of the chosen ones.
         median_range: of its points, in the cloud's unit; 0 of a scan without points.
         lasers: whether the data tell by which laser each point was measured; of a scan without points, too.
-        some_points: (m, 3) of its points, evenly in their order; none unless it is one of the chosen ones.
+        some_points: (m, 3) of its points, evenly in their order; of few scans of a drive.
     """
 
     index: int
@@ -146,12 +148,16 @@ class StatisticsCollector:
         self._scans: list[ScanStatistics] = []
         self._images: list[ImageStatistics] = []
         self._every_scan, self._every_image = -(-total // _SCANS), -(-total // _IMAGES)
+        self._every_cloud = max(1, total // _CLOUDS)
 
     def add(self, frame: Frame) -> None:
         """Add one frame, checked by :mod:`sst_graph.validation`."""
         if frame.scan is not None:
             closely = len(self._scans) % self._every_scan == 0
-            self._scans.append(scan_statistics(frame.index, frame.scan, closely))
+            found = scan_statistics(frame.index, frame.scan, closely)
+            if len(self._scans) % self._every_cloud == 0:
+                found = replace(found, some_points=some_points(frame.scan.points).copy())
+            self._scans.append(found)
         if frame.image is not None:
             closely = len(self._images) % self._every_image == 0
             self._images.append(image_statistics(frame.index, frame.image, closely))
@@ -168,9 +174,8 @@ def scan_statistics(index: int, scan: Scan, closely: bool = True) -> ScanStatist
     sweep = 0.0
     if scan.offsets_s is not None and len(scan.offsets_s):
         sweep = float(np.ptp(np.asarray(scan.offsets_s, np.float64)))
-    ground, heights, step, some = None, np.zeros(0), 0.0, scan.points[:0]
+    ground, heights, step = None, np.zeros(0), 0.0
     if closely:
-        some = some_points(scan.points).copy()
         step = _step(points)
         on_ground = _labelled_ground(scan.classes)
         ground = _ground(points[on_ground], points[~on_ground])
@@ -193,7 +198,6 @@ def scan_statistics(index: int, scan: Scan, closely: bool = True) -> ScanStatist
         step,
         median_range,
         lasers,
-        some,
     )
 
 
