@@ -138,7 +138,7 @@ def test_is_frozen() -> None:
         ({"time_offset_s": True}, "time_offset_s: found True, expected a number"),
         ({"covariance": np.eye(6).tolist()}, r"covariance: found shape \(6, 6\)"),
         ({"status": "fine"}, "status: found 'fine'"),
-        ({"camera": {"name": "image_2"}}, "camera: found no 'fx'"),
+        ({"camera": {"name": "image_2"}}, "camera: found no entry 'fx'"),
         ({"frames_used": [3]}, "frames_used: found 3, expected objects"),
         ({"frames_used": [{"drive": "a", "frame": 1.5}]}, r"frames_used\[0\]: frame: found 1.5"),
         ({"weak_directions": "none"}, "weak_directions: found 'none', expected a list"),
@@ -203,7 +203,7 @@ def test_a_key_given_twice_is_refused() -> None:
 def test_missing_key(key: str) -> None:
     document = _document()
     del document[key]
-    with pytest.raises(DataError, match=f"no '{key}'"):
+    with pytest.raises(DataError, match=f"no entry '{key}'"):
         CalibrationResult.from_json(json.dumps(document))
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -70,7 +71,7 @@ def open_drive_of(args: argparse.Namespace, path: Path, result: CalibrationResul
     Raises:
         ConfigError: an option contradicts the pairs that the result was made of; or as :func:`open_drive`.
     """
-    stored = _checked_options(result.read_as, place)
+    stored = checked_options(result.read_as, place)
     _check_given(args, stored, place)
     options = dict(SOURCE_DEFAULTS)
     options |= {name: stored[name] for name in (*PAIRING, *MEASUREMENT) if name in stored}
@@ -100,7 +101,7 @@ def warn_of_other_pairs(choice: str, options: Mapping[str, Any]) -> None:
 def reading_words(read_as: Mapping[str, Any]) -> str:
     """The options that are not the default's, as on a command line; empty where there are none."""
     return " ".join(
-        f"{_flag(name)} {read_as[name]}"
+        f"{_flag(name)} {shlex.quote(str(read_as[name]))}"
         for name, default in SOURCE_DEFAULTS.items()
         if name in read_as and read_as[name] != default
     )
@@ -186,7 +187,7 @@ def _stored_in(path: Path) -> Mapping[str, Any]:
     return stored if isinstance(stored, dict) else {}
 
 
-def _checked_options(read_as: Mapping[str, Any], place: Path) -> dict[str, Any]:
+def checked_options(read_as: Mapping[str, Any], place: Path) -> dict[str, Any]:
     """The options of a result that are still known; those that are not of their kind are refused.
 
     Raises:

@@ -50,7 +50,7 @@ class JsonTable:
 
     def value(self, key: str, default: Any = _REQUIRED) -> Any:
         if key not in self.data and default is _REQUIRED:
-            raise DataError(self.place, f"no '{key}'", f"'{key}'")
+            raise DataError(self.place, f"no entry '{key}'", "the file as it was written, whole")
         return self.data.get(key, default)
 
     def _at(self, key: str) -> str:

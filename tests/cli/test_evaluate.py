@@ -112,7 +112,7 @@ def test_evaluate_against_a_folder_that_holds_no_data(
     [
         (None, "no such file"),
         (b"", "no JSON"),
-        (b'{"format": "sst-graph/calibration", "version": 1}', "no 'camera'"),
+        (b'{"format": "sst-graph/calibration", "version": 1}', "no entry 'camera'"),
         (b'{"format": "other"}', "found format 'other'"),
     ],
 )

@@ -92,6 +92,15 @@ def test_json_is_one_strict_object(
     assert len(document["frames"]) == 9
 
 
+def test_how_the_drives_were_read_is_checked_before_it_is_said(
+    tmp_path: Path, result: CalibrationResult, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["inspect", written(tmp_path, replace(result, read_as={"cloud": "a b"}))]) == 0
+    assert "The drives were read with --cloud 'a b'." in capsys.readouterr().out
+    assert main(["inspect", written(tmp_path, replace(result, read_as={"image_shift": "../x"}))]) == 2
+    assert "read_as.image_shift: found '../x', expected a number" in capsys.readouterr().err
+
+
 def shown_in(folder: Path) -> set[str]:
     """Names in a folder that are not hidden."""
     return {path.name for path in folder.iterdir() if not path.name.startswith(".")}

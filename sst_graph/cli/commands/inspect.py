@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sst_graph.cli.messages import say
 from sst_graph.cli.output_places import check_apart
-from sst_graph.cli.reading import reading_words
+from sst_graph.cli.reading import checked_options, reading_words
 from sst_graph.errors import ConfigError
 from sst_graph.files import OutputKind, atomic_directory
 from sst_graph.inspect.inspection import Inspection, inspect_result, to_dict
@@ -34,9 +34,9 @@ def run(args: argparse.Namespace) -> int:
         with atomic_directory(args.plots, args.overwrite, PLOTS) as folder:
             inspection = inspect_result(read_result(args.result), args.next)
             names = _write_plots(inspection, folder)
-    read_as = inspection.result.read_as
+    read_as = checked_options(inspection.result.read_as, result_file(args.result))
     if args.json:
-        say(json.dumps({**to_dict(inspection), "read_as": dict(read_as)}, allow_nan=False))
+        say(json.dumps({**to_dict(inspection), "read_as": read_as}, allow_nan=False))
     else:
         parts = [inspection_text(inspection, args.all_frames)]
         if reading_words(read_as):
