@@ -155,6 +155,15 @@ def _nominal(drive: KeptDrive, change: Callable[[gtsam.Pose3], gtsam.Pose3]) -> 
     return replace(drive, nominal=change(drive.nominal))
 
 
+def _in_vehicle_axes(drive: KeptDrive) -> KeptDrive:
+    """Clouds and start in axes that begin on the ground at the rear axle, as base_link; lasers unnamed."""
+    pose = gtsam.Pose3(gtsam.Rot3(), np.array([1.4, 0.0, 1.8]))
+    moved = drive.with_scans(
+        lambda s: replace(s, points=s.points + pose.translation().astype(np.float32), rings=None)
+    )
+    return _nominal(moved, lambda T: T * pose.inverse())
+
+
 def _radians_as_degrees(cTl: gtsam.Pose3) -> gtsam.Pose3:
     """The camera's yaw -1.57, pitch 0, roll -1.57 in the LiDAR, given to a function that takes degrees."""
     lRc = gtsam.Rot3.Ypr(*np.radians([-0.5 * np.pi, 0.0, -0.5 * np.pi]))
@@ -178,6 +187,7 @@ INPUT_FAULTS: dict[str, InputFault] = {
     "clouds in cm": lambda d, o: with_points(d, 100.0 * np.eye(3)),
     "clouds in feet": lambda d, o: with_points(d, np.eye(3) / 0.3048),
     "clouds in camera axes": lambda d, o: with_points(d, _CAMERA_AXES),
+    "clouds in vehicle axes": lambda d, o: _in_vehicle_axes(d),
     "Tr inverted": lambda d, o: _nominal(d, lambda T: T.inverse()),
     "Tr in mm": lambda d, o: _nominal(d, _in_millimetres),
     "radians as degrees": lambda d, o: _nominal(d, _radians_as_degrees),
@@ -225,6 +235,7 @@ NAMED: dict[str, str] = {
     "clouds in cm": "the clouds are in centimetres",
     "clouds in feet": "the clouds are in feet",
     "clouds in camera axes": "the clouds are in the camera's axes",
+    "clouds in vehicle axes": "the clouds are not in the axes of the LiDAR",
     "Tr inverted": "the start (Tr) is inverted",
     "Tr in mm": "the translation of the start (Tr) is in millimetres",
     "radians as degrees": "radians that were taken as degrees",

@@ -38,10 +38,11 @@ def parse_lidar_pose(text: str) -> gtsam.Pose3:
 
 def lidar_pose_text(T_cloud_lidar: gtsam.Pose3) -> str:
     """A pose as :func:`parse_lidar_pose` reads it: to centimetres and tenths of a degree."""
-    angles = np.degrees(T_cloud_lidar.rotation().rpy())
-    metres = ",".join(f"{value:.2f}" for value in T_cloud_lidar.translation())
+    # Without a minus before a zero.
+    angles = np.degrees(T_cloud_lidar.rotation().rpy()).round(1) + 0.0
+    metres = ",".join(f"{value:.2f}" for value in T_cloud_lidar.translation().round(2) + 0.0)
     turned = ",".join(f"{value:.1f}" for value in angles)
-    return f"{metres},{turned}" if np.abs(angles).max() > 0.05 else metres
+    return f"{metres},{turned}" if angles.any() else metres
 
 
 class LidarFrameSource(ChangedSource):

@@ -340,7 +340,7 @@ def test_masks_of_another_size_are_refused() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fault", ["Tr inverted", "y flipped"])
+@pytest.mark.parametrize("fault", ["Tr inverted", "y flipped", "clouds in vehicle axes"])
 def test_what_would_make_the_labels_agree_names_the_cause(fault: str) -> None:
     wrong = INPUT_FAULTS[fault](drive(), other())
     result = calibrate(wrong, wrong.nominal)
