@@ -61,10 +61,10 @@ def other_axes(drives: Sequence[Drive]) -> Finding | None:
     if (np.abs(places - middle) > _SAME_M).any() or np.linalg.norm(middle[1:]) < _AWAY_M:
         return None
     pose = lidar_pose_text(_median_pose(found))
+    place = ", ".join(pose.split(",")[:3])
     return Finding(
         "the clouds are not in the axes of the LiDAR but in others, such as the vehicle's",
-        f"seen from {', '.join(f'{x:.2f}' for x in middle.round(2) + 0.0)} m in them the LiDAR's rings stand out, not from "
-        "their origin",
+        f"seen from {place} m in them the LiDAR's rings stand out, not from their origin",
         f"say where the LiDAR is in them, as --lidar-pose={pose} (better from tf or a drawing)",
     )
 

@@ -223,7 +223,7 @@ def test_names_of_loaders_are_unique() -> None:
     [
         ("{", "no JSON"),
         ("[1]", "a JSON list"),
-        ('{"time_offset_s": 0}', "no 'T_camera_lidar'"),
+        ('{"time_offset_s": 0}', "no entry 'T_camera_lidar'"),
         ('{"T_camera_lidar": [[1, 2], [3, 4]]}', r"shape \(2, 2\)"),
         ('{"T_camera_lidar": [[2,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}', "expected a rotation"),
         (
