@@ -34,6 +34,8 @@ DRIVES = ("STOP", "PARKED")
 BLOCK = re.compile(r"<!-- table: (?P<command>.+?) -->\n(?P<body>.*?)<!-- end of table -->", re.DOTALL)
 _STAMP = re.compile(r"^\*Made by sst-graph commit (?P<commit>[0-9a-f]+)\.\*$", re.MULTILINE)
 _ORIGIN = re.compile(r"^Made by `.*`, sst-graph .*$", re.MULTILINE)
+_LONGEST = 100
+"""Letters of a line that is kept beside tables: names, and no paragraph, which the page has once."""
 _ASSIGNMENT = re.compile(r"(?P<name>[A-Z_]+)=(?P<value>\S*)$")
 
 
@@ -73,7 +75,9 @@ def body(command: str, printed: str, commit: str) -> str:
     Raises:
         TableError: what was printed has no table.
     """
-    text = _ORIGIN.sub("", printed).strip()
+    lines = _ORIGIN.sub("", printed).splitlines()
+    text = "\n".join(line for line in lines if line.startswith("|") or len(line) <= _LONGEST).strip()
+    text = re.sub(r"\n{3,}", "\n\n", text)
     if not re.search(r"^\|.*\|$", text, re.MULTILINE):
         raise TableError(f"no table in what it printed: {text[-200:]!r}")
     return f"```\n{command}\n```\n\n{text}\n\n*Made by sst-graph commit {commit}.*\n"

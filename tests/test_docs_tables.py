@@ -41,7 +41,8 @@ def test_what_a_command_prints_replaces_the_table(tmp_path: Path) -> None:
     assert (empty.command, empty.commit) == (command, "")
     printed = make_tables.printed_by(command, {"STOP": str(tmp_path)})
     assert printed == "| a |\n|---|\n| STOP |\n"
-    body = make_tables.body(command, printed + "\nMade by `x`, sst-graph commit 1.\n", "abcdef12")
+    beside = 200 * "x" + "\nMade by `x`, sst-graph commit 1.\n"
+    body = make_tables.body(command, f"{printed}\n\n\n{beside}", "abcdef12")
     page.write_text(make_tables.replaced(page.read_text(), command, body))
     (made,) = make_tables.tables_of(page)
     assert made.commit == "abcdef12" and made.has(["page", "print"]) and not made.has(["other"])
