@@ -11,7 +11,7 @@ from sst_graph.data.lidar_pose import lidar_pose_text
 from sst_graph.diagnosis.finding import Finding
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import count_of
-from sst_graph.features.lidar_origin import LidarOrigin, lidar_origin, own_clearness
+from sst_graph.features.lidar_origin import lidar_origin, own_clearness
 from sst_graph.sampling import evenly_spread
 
 _MOST = 0.5
@@ -52,15 +52,15 @@ def other_axes(drives: Sequence[Drive]) -> Finding | None:
     drive = max(drives, key=lambda one: len(one.scans))
     known = () if drive.statistics is None else drive.statistics.scans
     clouds = [scan.some_points for scan in known if len(scan.some_points) >= _LEAST_POINTS]
-    chosen = [clouds[k].astype(np.float64) for k in evenly_spread(range(len(clouds)), _SCANS)]
+    chosen = [cloud.astype(np.float64) for cloud in evenly_spread(clouds, _SCANS)]
     if len(chosen) < _SCANS or max(map(own_clearness, chosen)) > _CLEAR:
         return None
     found = [lidar_origin(cloud) for cloud in chosen]
-    places = np.array([one.T_cloud_lidar.translation() for one in found])
-    middle = np.median(places, axis=0)
-    if (np.abs(places - middle) > _SAME_M).any() or np.linalg.norm(middle[1:]) < _AWAY_M:
+    places, middle = np.array([pose.translation() for pose in found]), _median_pose(found)
+    away = middle.translation()
+    if (np.abs(places - away) > _SAME_M).any() or np.linalg.norm(away[1:]) < _AWAY_M:
         return None
-    pose = lidar_pose_text(_median_pose(found))
+    pose = lidar_pose_text(middle)
     place = ", ".join(pose.split(",")[:3])
     return Finding(
         "the clouds are not in the axes of the LiDAR but in others, such as the vehicle's",
@@ -69,8 +69,7 @@ def other_axes(drives: Sequence[Drive]) -> Finding | None:
     )
 
 
-def _median_pose(found: Sequence[LidarOrigin]) -> gtsam.Pose3:
-    poses = [one.T_cloud_lidar for one in found]
+def _median_pose(poses: Sequence[gtsam.Pose3]) -> gtsam.Pose3:
     roll, pitch, yaw = np.median([pose.rotation().rpy() for pose in poses], axis=0)
     return gtsam.Pose3(
         gtsam.Rot3.RzRyRx(roll, pitch, yaw), np.median([pose.translation() for pose in poses], axis=0)

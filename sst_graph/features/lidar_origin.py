@@ -7,8 +7,6 @@ where they stand out most, whatever the order of the points, and without laser n
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
@@ -32,19 +30,6 @@ _STAGES = ((100, 1.0), (200, 0.25), (PARTS_OF_RINGS, 0.1))
 """Parts that are compared with strips, and the size of the simplex: coarse parts have a wide optimum."""
 _EVALUATIONS = 150
 """Of each stage."""
-
-
-@dataclass(frozen=True)
-class LidarOrigin:
-    """Where rings stand out most.
-
-    Attributes:
-        T_cloud_lidar: pose of the LiDAR in the cloud's axes; its turn about its own axis is not known, and 0.
-        clearness: how clearly they stand out there (:func:`~sst_graph.features.lidar_beams.clearness`).
-    """
-
-    T_cloud_lidar: gtsam.Pose3
-    clearness: float
 
 
 def some_points(points: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -71,16 +56,15 @@ def clearness_from(points: FloatArray, axes: FloatArray, parts: int = PARTS_OF_R
     return clearness(height[far] / rho[far], parts) if np.count_nonzero(far) >= PARTS_OF_RINGS else 0.0
 
 
-def lidar_origin(points: FloatArray) -> LidarOrigin:
-    """Where rings stand out most, of points (n, 3) [m] in axes whose z points up within some degrees."""
+def lidar_origin(points: FloatArray) -> gtsam.Pose3:
+    """T_cloud_lidar where rings stand out most, of points (n, 3) [m] in axes whose z points up within some
+    degrees. The turn about the LiDAR's own axis is not known, and 0."""
     parts, size = _STAGES[0]
     places = sorted(_PLACES, key=lambda axes: -clearness_from(points, axes, parts))[:_BEST_PLACES]
     axes = max((_climbed(points, place, parts, size) for place in places), key=lambda found: found[1])[0]
-    found = 0.0
     for parts, size in _STAGES[1:]:
-        axes, found = _climbed(points, axes, parts, size)
-    turn = gtsam.Rot3.RzRyRx(float(axes[3]), float(axes[4]), 0.0)
-    return LidarOrigin(gtsam.Pose3(turn, axes[:3]), found)
+        axes = _climbed(points, axes, parts, size)[0]
+    return gtsam.Pose3(gtsam.Rot3.RzRyRx(float(axes[3]), float(axes[4]), 0.0), axes[:3])
 
 
 def _climbed(points: FloatArray, begin: FloatArray, parts: int, size: float) -> tuple[FloatArray, float]:
