@@ -145,7 +145,6 @@ def usual_ground(drive: Drive) -> Ground | None:
     return Ground(
         up / max(float(np.linalg.norm(up)), 1e-9),
         float(np.median([ground.height for ground in grounds])),
-        float(np.median([ground.tolerance for ground in grounds])),
         float(np.median([ground.share for ground in grounds])),
         float(np.median([ground.smooth for ground in grounds])),
     )

@@ -45,7 +45,6 @@ class Ground:
     Attributes:
         up: (3,) unit normal, from the ground towards the LiDAR.
         height: of the LiDAR above it.
-        tolerance: distance within which a point lies on it.
         share: of the points that lie on it.
         smooth: share of the points that lie on a slope of :data:`_STEEPEST` at most with those around them,
             as on hills.
@@ -53,7 +52,6 @@ class Ground:
 
     up: FloatArray
     height: float
-    tolerance: float
     share: float
     smooth: float
 
@@ -305,7 +303,7 @@ def _ground(points: FloatArray, others: FloatArray) -> Ground | None:
     up = normal if height >= 0.0 else -normal
     if abs(height) < tolerance and np.count_nonzero(others @ up < 0.0) > 0.5 * len(others):
         up = -up
-    return Ground(up, abs(height), tolerance, float(on.mean()), _smooth(points, up, 0.5 * tolerance))
+    return Ground(up, abs(height), float(on.mean()), _smooth(points, up, 0.5 * tolerance))
 
 
 def _smooth(points: FloatArray, up: FloatArray, tolerance: float) -> float:
