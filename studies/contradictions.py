@@ -10,6 +10,7 @@ global search, and the stamps' rhythm is not looked at: what is found is found b
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -125,8 +126,9 @@ def main() -> None:
             found = found_in(seed, [list])[0]
             sentences = () if found is None else found.sentences
             alarms += bool(sentences)
-            print(f"seed {seed}, {street(seed).motion}: {' '.join(sentences) or 'nothing'}", flush=True)
-        print(f"{alarms} of {len(seeds)} clean drives raise an alarm")
+            said = " ".join(sentences) or "nothing"
+            print(f"seed {seed}, {street(seed).motion}: {said}", file=sys.stderr, flush=True)
+        print(f"| clean drives | with an alarm |\n|---|---|\n| {len(seeds)} | {alarms} |")
         return
     sizes = [("knock", f"{degrees:g} deg") for degrees in KNOCKS_DEG]
     sizes += [("clock", f"{ms:g} ms") for ms in CLOCKS_MS]
@@ -144,6 +146,7 @@ def main() -> None:
             print(
                 f"seed {seed}, {street(seed).motion}, {' '.join(sizes[number])} at {first}: "
                 f"{' '.join(found.sentences) if found else 'no solution'}",
+                file=sys.stderr,
                 flush=True,
             )
     print("| step | size | found | place within 3 frames |\n|---|---|---|---|")

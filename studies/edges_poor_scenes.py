@@ -8,6 +8,7 @@ No result that is off by more than a degree may be ``ok``. Starts are 4 deg and 
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -68,6 +69,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--frames", type=int, default=15)
     options = parser.parse_args()
+    print("| scene | seed | rotation [deg] | ATD [cm] | status |\n|---|---|---|---|---|")
     for scene in SCENES:
         for seed in range(options.seeds):
             config = SimulationConfig(
@@ -82,9 +84,10 @@ def main() -> None:
             errors = calibration_errors(
                 result.T_camera_lidar, result.time_offset_s, drive.truth, result.covariance
             )
-            print(f"{scene} {seed}: {result.status}, {errors.qad_deg:.2f} deg, {100 * errors.atd_m:.1f} cm")
+            found = f"{errors.qad_deg:.2f} | {100 * errors.atd_m:.1f} | {result.status}"
+            print(f"| {scene} | {seed} | {found} |", flush=True)
             for reason in result.reasons:
-                print(f"    {reason}")
+                print(f"{scene} {seed}: {reason}", file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

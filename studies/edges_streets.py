@@ -4,27 +4,35 @@
     OMP_NUM_THREADS=1 python -m studies.edges_streets own-504 third-900 ../shared/data/DRIVE
 
 Starts are within 4.4 deg and 10 cm by axis. Errors are in the LiDAR's axes: roll, pitch, yaw; forward, left,
-up. Real drives are read with ``--image-shift 1``; their reference is taken for exact.
+up. Real drives are read with ``--image-shift 1``; their reference is taken for exact. Reasons go to stderr.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph import CalibrationConfig, calibrate, open_source
+from sst_graph.experiments.markdown import lines, table
 from sst_graph.simulator import SimulationConfig, simulate
-from sst_graph.types import Source
+from sst_graph.types import GroundTruth, Source
 from studies.simulators.third_street import ThirdConfig, ThirdStreet
 
 FloatArray = NDArray[np.float64]
 STREETS = [*(f"own-{seed}" for seed in range(504, 510)), *(f"third-{seed}" for seed in range(900, 906))]
 OFFSETS_S = (0.05, -0.08, 0.0)
 UNITS = np.array([*[180.0 / np.pi] * 3, 100.0, 100.0, 100.0, 1e3])
+HEAD = (
+    "| drive | rotation [deg] | translation [cm] | time offset [ms] "
+    "| sigma: rotation | translation | time offset | NEES / 7 | status | seconds |"
+)
 
 
 def source_of(name: str) -> Source:
@@ -53,40 +61,74 @@ def start_step(name: str) -> FloatArray:
     return np.r_[np.radians(rng.uniform(-5.0, 5.0, 3) * np.sqrt(0.75)), rng.uniform(-0.1, 0.1, 3)]
 
 
-def row(values: FloatArray) -> str:
-    """Seven errors or sigmas."""
+def cells(values: FloatArray) -> tuple[str, str, str]:
+    """Seven errors or sigmas, with their signs: rotation [deg], translation [cm], time offset [ms]."""
     r = values * UNITS
-    return f"{r[0]:+.3f} {r[1]:+.3f} {r[2]:+.3f} | {r[3]:+5.1f} {r[4]:+5.1f} {r[5]:+5.1f} | {r[6]:+5.1f}"
+    return (
+        ", ".join(f"{angle:+.2f}" for angle in r[:3]),
+        ", ".join(f"{shift:+.1f}" for shift in r[3:6]),
+        f"{r[6]:+.1f}",
+    )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("names", nargs="*", default=STREETS)
-    errors, nees = [], []
-    for name in parser.parse_args().names:
+def sigma_cells(covariance: FloatArray) -> tuple[str, str, str]:
+    """Sigmas of a (7, 7) covariance, as :func:`cells` has errors."""
+    rotation, translation, offset = cells(np.sqrt(np.diag(covariance)))
+    return rotation.replace("+", ""), translation.replace("+", ""), offset.replace("+", "")
+
+
+def error_of(T_camera_lidar: gtsam.Pose3, time_offset_s: float, truth: GroundTruth) -> FloatArray:
+    """(7,) from the truth to an estimate, in the LiDAR's axes [rad, m, s]."""
+    step = gtsam.Pose3.Logmap(truth.cTl.between(T_camera_lidar))
+    return np.append(step, time_offset_s - truth.time_offset_s)
+
+
+def nees_of(error: FloatArray, covariance: FloatArray) -> float:
+    """Squared error over the covariance, over its dimension of seven."""
+    return float(error @ np.linalg.solve(covariance, error)) / 7.0
+
+
+def short(name: str) -> str:
+    """A street's name, or the last part of a drive's folder."""
+    return f"`{Path(name).name}`"
+
+
+def rows(names: Sequence[str], found: list[tuple[FloatArray, float]]) -> Iterator[Sequence[str]]:
+    """A row a drive; errors and NEES go to ``found``."""
+    for name in names:
         source = source_of(name)
         truth, began = source.truth, time.process_time()
         assert truth is not None
         result = calibrate(source, truth.cTl.retract(start_step(name)), CalibrationConfig(method="edges"))
         seconds = time.process_time() - began
-        step = gtsam.Pose3.Logmap(truth.cTl.between(result.T_camera_lidar))
-        error = np.append(step, result.time_offset_s - truth.time_offset_s)
-        errors.append(error)
-        nees.append(float(error @ np.linalg.solve(result.covariance, error)) / 7.0)
-        sigmas = np.sqrt(np.diag(result.covariance))
-        print(f"{name:10s} {result.status}  {row(error)}  sigmas {row(sigmas)}", end="")
-        print(f"  NEES/7 {nees[-1]:.2f}  {seconds:.0f} s", flush=True)
+        error = error_of(result.T_camera_lidar, result.time_offset_s, truth)
+        nees = nees_of(error, result.covariance)
+        found.append((error * UNITS, nees))
         for reason in result.reasons:
-            print(f"    {reason}", flush=True)
-    table = np.abs(np.array(errors) * UNITS)
-    rotation, shift = np.linalg.norm(table[:, :3], axis=1), table[:, 3:6].mean(axis=1)
-    for what, column in (
-        ("deg", rotation),
-        ("cm ATD", shift),
-        ("ms", table[:, 6]),
-        ("NEES/7", np.array(nees)),
-    ):
-        print(f"{what}: median {np.median(column):.3f}, mean {column.mean():.3f}, largest {column.max():.3f}")
+            print(f"{name}: {reason}", file=sys.stderr, flush=True)
+        sigmas = sigma_cells(result.covariance)
+        yield short(name), *cells(error), *sigmas, f"{nees:.1f}", result.status, f"{seconds:.0f}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("names", nargs="*", default=STREETS)
+    found: list[tuple[FloatArray, float]] = []
+    for line in lines(HEAD, rows(parser.parse_args().names, found)):
+        print(line, flush=True)
+    errors, nees = np.array([error for error, _ in found]), np.array([each for _, each in found])
+    rotation, shift = np.linalg.norm(errors[:, :3], axis=1), np.abs(errors[:, 3:6]).mean(axis=1)
+    of_all = (
+        ("rotation [deg]", rotation),
+        ("ATD [cm]", shift),
+        ("time offset [ms]", np.abs(errors[:, 6])),
+        ("NEES / 7", nees),
+    )
+    summary = [
+        (what, *(f"{value:.2f}" for value in (np.median(each), each.mean(), each.max())))
+        for what, each in of_all
+    ]
+    print("\n" + table("| of all | median | mean | largest |", summary))
 
 
 if __name__ == "__main__":

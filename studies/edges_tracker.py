@@ -7,21 +7,65 @@ Starts of the streets are those of ``studies/edges_streets.py``, that of a drive
 a drive's labels only the masks are read, which keep moving things out of visual odometry: a folder without
 label files is a drive that nobody labelled. Errors and sigmas are in the LiDAR's axes: roll, pitch, yaw;
 forward, left, up. ``--at-once`` makes the start with the frame that it is due with, so that a short drive
-shows the estimate frame by frame.
+shows the estimate frame by frame. Contradictions and weak directions go to stderr.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 import time
+from collections.abc import Sequence
 
 import numpy as np
 
 from sst_graph import CalibrationConfig, Tracker, TrackerConfig
+from sst_graph.experiments.markdown import lines
 from sst_graph.odometry.sweep import with_sweep
-from studies.edges_streets import row, source_of, start_step
+from studies.edges_streets import cells, error_of, short, sigma_cells, source_of, start_step
 
 AWAY = np.array([*np.radians([3.0, -4.0, 2.5]), 0.06, -0.08, 0.05])
+
+
+HEAD = (
+    "| drive | rotation [deg] | translation [cm] | time offset [ms] | sigma: rotation | translation "
+    "| time offset | largest error [sigma] | status | a frame [ms]: median, largest | window at the end [s] |"
+)
+
+
+def cells_of(name: str, at_once: bool) -> Sequence[str]:
+    """The cells of one drive."""
+    drive = with_sweep(source_of(name), True)
+    truth = drive.truth
+    if truth is None or truth.time_offset_s is None:
+        raise SystemExit(f"{name}: no reference calibration")
+    begin = truth.cTl.retract(start_step(name) if name.startswith(("own-", "third-")) else AWAY)
+    config = TrackerConfig(calibration=CalibrationConfig(method="edges"))
+    tracker = Tracker(drive.camera, config, begin, sweep=drive.sweep_decision)
+    if at_once:
+        tracker.initializer.work_per_frame = None
+    seconds = []
+    for frame in drive:
+        began = time.process_time()
+        tracker.add(frame)
+        seconds.append(time.process_time() - began)
+    began = time.process_time()
+    update = tracker.optimize()
+    at_end = time.process_time() - began
+    for reason in (*update.contradictions, *(weak.sentence for weak in update.weak_directions)):
+        print(f"{name}: {reason}", file=sys.stderr, flush=True)
+    error = error_of(update.T_camera_lidar, update.time_offset_s, truth)
+    worst = float(np.abs(error / update.sigmas).max())
+    milliseconds = 1e3 * np.array(seconds)
+    return (
+        short(name),
+        *cells(error),
+        *sigma_cells(update.covariance),
+        f"{worst:.1f}",
+        update.status,
+        f"{np.median(milliseconds):.0f}, {milliseconds.max():.0f}",
+        f"{at_end:.0f}",
+    )
 
 
 def main() -> None:
@@ -29,31 +73,8 @@ def main() -> None:
     parser.add_argument("names", nargs="+")
     parser.add_argument("--at-once", action="store_true")
     arguments = parser.parse_args()
-    for name in arguments.names:
-        drive = with_sweep(source_of(name), True)
-        truth = drive.truth
-        if truth is None or truth.time_offset_s is None:
-            parser.error(f"{name}: no reference calibration")
-        begin = truth.cTl.retract(start_step(name) if name.startswith(("own-", "third-")) else AWAY)
-        config = TrackerConfig(calibration=CalibrationConfig(method="edges"))
-        tracker = Tracker(drive.camera, config, begin, sweep=drive.sweep_decision)
-        if arguments.at_once:
-            tracker.initializer.work_per_frame = None
-        seconds, statuses = [], list[str]()
-        for frame in drive:
-            began = time.process_time()
-            statuses.append(tracker.add(frame).status)
-            seconds.append(time.process_time() - began)
-        began = time.process_time()
-        update = tracker.optimize()
-        late = update.time_offset_s - truth.time_offset_s
-        error = np.append(truth.cTl.localCoordinates(update.T_camera_lidar), late)
-        print(f"{name}: {update.status}, {1e3 * np.median(seconds):.0f} ms a frame (median), ", end="")
-        print(f"the slowest {1e3 * max(seconds):.0f} ms, the window at the end ", end="")
-        print(f"{time.process_time() - began:.0f} s; before: {', '.join(dict.fromkeys(statuses))}")
-        print(f"  errors {row(error)}\n  sigmas {row(update.sigmas)}", flush=True)
-        for reason in (*update.contradictions, *(weak.sentence for weak in update.weak_directions)):
-            print(f"  {reason}")
+    for line in lines(HEAD, (cells_of(name, arguments.at_once) for name in arguments.names)):
+        print(line, flush=True)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ the fusion refuses as contradicting, at its own significance of 0.001.
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -79,7 +80,7 @@ def main() -> None:
         single += [nees(part) for part in parts]
         together.append(outcome(parts))
         apart.append(outcome([replace(part, common=Common()) for part in parts]))
-        print(f"vehicle {vehicle}: {together[-1]} {apart[-1]}", flush=True)
+        print(f"vehicle {vehicle}: {together[-1]} {apart[-1]}", file=sys.stderr, flush=True)
     print(f"\n{len(together)} vehicles, {used} drives\n")
     print("| | NEES / dimension: mean, median, largest | refused |\n|---|---|---|")
     print(f"| drives by themselves | {np.mean(single):.2f}, {np.median(single):.2f}, {max(single):.1f} | – |")

@@ -5,13 +5,14 @@
     OMP_NUM_THREADS=1 python -m studies.labels_and_edges same own-504 third-900 ../shared/data/DRIVE
 
 Real drives are read with ``--image-shift 0`` for ``part``, so that a scan's own image is the one of its
-instant, and with 1 for ``same``.
+instant, and with 1 for ``same``. Prints a table; reasons go to stderr.
 """
 
 from __future__ import annotations
 
 import argparse
-import time
+import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import gtsam
@@ -21,14 +22,25 @@ from sst_graph import CalibrationConfig, calibrate, open_source
 from sst_graph.batch.by_edges.fusion import Fused
 from sst_graph.batch.method_estimate import MethodEstimate
 from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.experiments.markdown import lines
 from sst_graph.result import CalibrationResult
-from sst_graph.types import Frame, GroundTruth, SemanticClass, Source
-from studies.edges_streets import FloatArray, row, source_of, start_step
+from sst_graph.types import Frame, SemanticClass
+from studies.edges_streets import (
+    FloatArray,
+    cells,
+    error_of,
+    nees_of,
+    short,
+    sigma_cells,
+    source_of,
+    start_step,
+)
 
 KEPT = {
     "first": lambda k, n: k < n // 2,
     "every4": lambda k, n: k % 4 == 0,
 }
+HEAD = "| drive | by | rotation, ATD, time offset | each [deg; cm; ms] | their sigmas | NEES / 7 | |"
 
 
 def bare(frame: Frame) -> Frame:
@@ -41,47 +53,39 @@ def bare(frame: Frame) -> Frame:
     return replace(frame, scan=scan, image=image)
 
 
-def error_of(truth: GroundTruth, cTl: gtsam.Pose3, time_offset_s: float) -> FloatArray:
-    """(7,) step from the truth."""
-    return np.append(gtsam.Pose3.Logmap(truth.cTl.between(cTl)), time_offset_s - truth.time_offset_s)
-
-
-def show(name: str, error: FloatArray, covariance: FloatArray, more: str = "") -> None:
-    nees = float(error @ np.linalg.solve(covariance, error)) / 7.0
+def row(name: str, by: str, error: FloatArray, covariance: FloatArray, more: str = "") -> Sequence[str]:
+    """A row of a drive: the size of the errors, all seven, their sigmas and NEES."""
     degrees, shift = np.degrees(np.linalg.norm(error[:3])), 100.0 * np.abs(error[3:6]).mean()
-    print(
-        f"{name:28s} {degrees:.3f} deg {shift:5.2f} cm {1e3 * error[6]:+6.2f} ms  NEES/7 {nees:4.2f}  ",
-        end="",
-    )
-    print(f"errors {row(error)}  sigmas {row(np.sqrt(np.diag(covariance)))}  {more}", flush=True)
+    sizes = f"{degrees:.2f} deg, {shift:.1f} cm, {1e3 * error[6]:+.1f} ms"
+    every, sigmas = "; ".join(cells(error)), "; ".join(sigma_cells(covariance))
+    return short(name), by, sizes, every, sigmas, f"{nees_of(error, covariance):.1f}", more
 
 
-def part(source: Source, start: gtsam.Pose3, kept: str) -> None:
+def part(name: str, kept: str) -> Iterator[Sequence[str]]:
     """Labels in a part of the frames: what labels say, what edges say, and both."""
+    simulated = name.startswith(("own-", "third-"))
+    source = source_of(name) if simulated else open_source(name, image_shift=0)
     whole, truth = KeptDrive.of(source), source.truth
     assert truth is not None
     count = len(whole.frames)
     frames = tuple(f if KEPT[kept](k, count) else bare(f) for k, f in enumerate(whole.frames))
-    began = time.process_time()
+    start = truth.cTl.retract(start_step(name))
     result = calibrate(replace(whole, frames=frames), start, CalibrationConfig(method="both"))
-    seconds = time.process_time() - began
     said = result.diagnostics.get("both", {})
     for kind in ("labels", "edges"):
         if kind in said:
-            error = error_of(
-                truth, gtsam.Pose3(np.array(said[kind]["T_camera_lidar"])), said[kind]["time_offset_s"]
-            )
-            show(
-                f"  {kind}", error, np.diag(np.square(said[kind]["sigmas"])), f"{said[kind]['frames']} frames"
-            )
-    error = error_of(truth, result.T_camera_lidar, result.time_offset_s)
-    show(f"  {result.method}", error, result.covariance, f"{result.status} {seconds:.0f} s")
+            pose = gtsam.Pose3(np.array(said[kind]["T_camera_lidar"]))
+            error = error_of(pose, said[kind]["time_offset_s"], truth)
+            yield row(name, kind, error, np.diag(np.square(said[kind]["sigmas"])))
+    error = error_of(result.T_camera_lidar, result.time_offset_s, truth)
+    yield row(name, result.method, error, result.covariance, result.status)
     for reason in result.reasons:
-        print(f"    {reason}")
+        print(f"{name}: {reason}", file=sys.stderr, flush=True)
 
 
-def same(source: Source, start: gtsam.Pose3) -> None:
+def same(name: str) -> Iterator[Sequence[str]]:
     """All frames by labels, all frames by edges, and the product as if the frames were different."""
+    source = source_of(name)
     truth = source.truth
     assert truth is not None
     configs = {
@@ -89,13 +93,14 @@ def same(source: Source, start: gtsam.Pose3) -> None:
         "joint, no motion": CalibrationConfig(method="joint", use_motion="never"),
         "edges": CalibrationConfig(method="edges"),
     }
-    results = {name: calibrate(source, start, config) for name, config in configs.items()}
-    for name, result in results.items():
-        error = error_of(truth, result.T_camera_lidar, result.time_offset_s)
-        show(f"  {name}", error, result.covariance, result.status)
+    start = truth.cTl.retract(start_step(name))
+    results = {by: calibrate(source, start, config) for by, config in configs.items()}
+    for by, result in results.items():
+        error = error_of(result.T_camera_lidar, result.time_offset_s, truth)
+        yield row(name, by, error, result.covariance, result.status)
     fused = Fused.of(estimate_of(results["joint, no motion"]), estimate_of(results["edges"]))
-    error = error_of(truth, fused.state.cTl, fused.state.time_offsets_s[0])
-    show("  product", error, fused.covariance, f"chi-squared of 7: {fused.chi2:.1f}")
+    error = error_of(fused.state.cTl, fused.state.time_offsets_s[0], truth)
+    yield row(name, "product", error, fused.covariance, f"chi-squared of 7: {fused.chi2:.1f}")
 
 
 def estimate_of(result: CalibrationResult) -> MethodEstimate:
@@ -110,16 +115,9 @@ def main() -> None:
     kept, names = (args.names[0], args.names[1:]) if args.what == "part" else ("", args.names)
     if args.what == "part" and kept not in KEPT:
         parser.error(f"part: found {kept}, expected one of {', '.join(KEPT)}")
-    for name in names:
-        print(name)
-        simulated = name.startswith(("own-", "third-"))
-        source = source_of(name) if simulated or args.what == "same" else open_source(name, image_shift=0)
-        assert source.truth is not None
-        start = source.truth.cTl.retract(start_step(name))
-        if args.what == "part":
-            part(source, start, kept)
-        else:
-            same(source, start)
+    found = (each for name in names for each in (part(name, kept) if kept else same(name)))
+    for line in lines(HEAD, found):
+        print(line, flush=True)
 
 
 if __name__ == "__main__":

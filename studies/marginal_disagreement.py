@@ -108,14 +108,13 @@ def _miss(joint: CalibrationMarginal, fused: CalibrationMarginal) -> float:
 
 
 def main() -> None:
-    print("apart   own estimates" + "".join(f"   round {k + 1}" for k in range(ROUNDS)))
+    print("| drives apart | at their own estimates |" + "".join(f" round {k + 1} |" for k in range(ROUNDS)))
+    print("|---" * (2 + ROUNDS) + "|")
     for apart in (0.0, 2.0, 4.0, 8.0, 16.0):
         found = [pair(seed, apart) for seed in range(6)]
         misses = np.median([misses for _, misses in found], axis=0)
-        print(
-            f"{np.median([d for d, _ in found]):5.1f}" + "".join(f"{miss:10.4f}" for miss in misses),
-            flush=True,
-        )
+        cells = " | ".join(f"{miss:.4f}" for miss in misses)
+        print(f"| {np.median([distance for distance, _ in found]):.1f} | {cells} |", flush=True)
 
 
 if __name__ == "__main__":

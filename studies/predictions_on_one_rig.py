@@ -31,6 +31,8 @@ def first(drive: Drive, count: int) -> Drive:
 
 
 def main() -> None:
+    print("| street | frames added | rot x | rot y | rot z | x | y | z | offset | geometric mean |")
+    print("|---" * 10 + "|")
     for seed in map(int, sys.argv[1:]):
         street = SimulationConfig(
             seed=seed,
@@ -57,7 +59,8 @@ def main() -> None:
             predicted = np.sqrt(np.diag(predicted_covariance(found[0].covariance, more, lasting)))
             ratios = np.sqrt(np.diag(result.covariance)) / predicted
             mean = float(np.exp(np.log(ratios).mean()))
-            print(f"seed {seed} +{count - CUTS[0]}: {ratios.round(2)}, geometric mean {mean:.2f}", flush=True)
+            cells = " | ".join(f"{ratio:.2f}" for ratio in (*ratios, mean))
+            print(f"| {seed} | {count - CUTS[0]} | {cells} |", flush=True)
 
 
 if __name__ == "__main__":

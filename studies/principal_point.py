@@ -12,17 +12,15 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-from pathlib import Path
 from unittest import mock
 
-import gtsam
 import numpy as np
 
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drives
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.experiments.wrong_drives import with_principal_point
-from studies.edges_streets import row, source_of, start_step
+from studies.edges_streets import error_of, nees_of, short, sigma_cells, source_of, start_step
 
 OFF_PX = ((0.0, 0.0), (5.0, 0.0), (0.0, -6.0))
 PREVALENCES = (0.02, 0.1, 0.25)
@@ -35,7 +33,7 @@ def main() -> None:
     parser.add_argument("--method", choices=["joint", "edges"], default="joint")
     options = parser.parse_args()
     config = CalibrationConfig(method=options.method)
-    print("| drive | cx, cy off by | prevalence | status | worst axis | NEES / 7 | sigmas |")
+    print("| drive | cx, cy off by | prevalence | status | worst axis [sigma] | NEES / 7 | sigmas [deg] |")
     print("|---" * 7 + "|")
     for name in options.names:
         source = source_of(name)
@@ -48,14 +46,12 @@ def main() -> None:
                 believed = {n: replace(ASSUMPTIONS[n], prevalence=prevalence) for n in ("cx", "cy")}
                 with mock.patch.dict(ASSUMPTIONS, believed):
                     result = calibrate_prepared(drives, start, config)
-                step = gtsam.Pose3.Logmap(truth.cTl.between(result.T_camera_lidar))
-                error = np.append(step, result.time_offset_s - truth.time_offset_s)
-                sigmas = np.sqrt(np.diag(result.covariance))
-                nees = float(error @ np.linalg.solve(result.covariance, error)) / 7.0
-                worst = float(np.abs(error / sigmas).max())
+                error = error_of(result.T_camera_lidar, result.time_offset_s, truth)
+                worst = float(np.abs(error / np.sqrt(np.diag(result.covariance))).max())
+                nees, rotation = nees_of(error, result.covariance), sigma_cells(result.covariance)[0]
                 print(
-                    f"| {Path(name).name} | {off[0]:g}, {off[1]:g} px | {prevalence:g} | {result.status} "
-                    f"| {worst:.1f} | {nees:.2f} | {row(sigmas)} |",
+                    f"| {short(name)} | {off[0]:g}, {off[1]:g} px | {prevalence:g} | {result.status} "
+                    f"| {worst:.1f} | {nees:.2f} | {rotation} |",
                     flush=True,
                 )
 

@@ -1,4 +1,4 @@
-"""Drift mode against a known random walk: is it followed, and do the history's sigmas cover it? Prints JSON.
+"""Drift mode against a random walk: is it followed, and do the history's sigmas cover it? Prints a table.
 
     OMP_NUM_THREADS=1 python -m studies.tracker_drift --streets 5
 
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 from dataclasses import dataclass
 
 import gtsam
@@ -105,7 +104,12 @@ def main() -> None:
     args = parser.parse_args()
     streets = [run(seed, args.frames) for seed in range(args.streets)]
     mean = {name: float(np.mean([street[name] for street in streets])) for name in streets[0]}
-    print(json.dumps({"mean": mean, "streets": streets}, indent=2))
+    print("| | rms error of the history | its sigma | within 1.96 sigma |\n|---|---|---|---|")
+    for what, name, unit in (("yaw", "yaw_deg", "deg"), ("time offset", "offset_ms", "ms")):
+        rms, sigma, covered = (mean[f"{name}_{key}"] for key in ("rms", "sigma", "covered_95"))
+        print(f"| {what} | {rms:.3f} {unit} | {sigma:.3f} {unit} | {covered:.0%} |")
+    alarms = sum(street["alarms"] for street in streets)
+    print(f"\nMeans over {len(streets)} streets, {alarms:.0f} alarms, {mean['walked_deg']:.2f} deg of yaw.")
 
 
 if __name__ == "__main__":

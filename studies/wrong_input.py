@@ -13,7 +13,7 @@ real drive being known to 0.1 deg, 1 cm and 5 ms. Real drives start 1.5 deg and 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,11 +27,14 @@ from sst_graph.batch.config import Method
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.diagnosis import preflight
 from sst_graph.errors import SstGraphError
+from sst_graph.experiments.markdown import lines
 from sst_graph.metrics import TruthSigma, calibration_errors, tangent_error
 from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.types import Guess
 
 CLEAN, RIGHT = "clean", "right camera"
+HEAD = "| drive | mistake | as it should be | status | error of the answer | said first |"
+SUBTLE_HEAD = "| drive | fault | as it should be | status | error | sigmas | said first |"
 MOST_SIGMAS = 3.0
 REFERENCE = TruthSigma(0.1, 0.01, 0.005)
 """Of the published calibrations of real drives."""
@@ -45,18 +48,18 @@ def street(seed: int, frames: int, right: bool = False) -> KeptDrive:
     return right_camera(made) if right else KeptDrive.of(made, sweep="auto")
 
 
-def row(name: str, drive: KeptDrive, quick: bool) -> tuple[str, bool]:
-    """A line of the table, and whether it is as it should be: a fault named and not ok, clean data silent."""
+def row(name: str, drive: KeptDrive, quick: bool) -> tuple[Sequence[str], bool]:
+    """Cells of the table, and whether it is as it should be: a fault named and not ok, clean data silent."""
     config = CalibrationConfig()
     try:
         prepared = prepare_drives([drive], config)
         certain = preflight(prepared, Guess(drive.nominal, 0.0), config.classes) if quick else ()
         if certain:
             sentence = certain[0].sentence
-            return f"before the solution | | {sentence}", name in NAMED and NAMED[name] in sentence
+            return ("before the solution", "", sentence), name in NAMED and NAMED[name] in sentence
         result = calibrate_prepared(prepared, drive.nominal, config)
     except SstGraphError as error:
-        return f"refused | {error}", NAMED.get(name, "") in str(error) and name in NAMED
+        return ("refused", "", str(error)), NAMED.get(name, "") in str(error) and name in NAMED
     first = result.reasons[0] if result.reasons else ""
     error_text = ""
     if drive.truth is not None:
@@ -67,11 +70,11 @@ def row(name: str, drive: KeptDrive, quick: bool) -> tuple[str, bool]:
     named = not any(words in first for words in NAMED.values())
     if name in NAMED:
         named = NAMED[name] in first and result.status != "ok"
-    return f"{result.status} | {error_text} | {first}", named
+    return (result.status, error_text, first), named
 
 
-def subtle_row(name: str, drive: KeptDrive, method: Method, real: bool) -> tuple[str, bool]:
-    """A line of the table of faults that leave a drive plausible, and whether the result can be believed.
+def subtle_row(name: str, drive: KeptDrive, method: Method, real: bool) -> tuple[Sequence[str], bool]:
+    """Cells of the table of faults that leave a drive plausible, and whether the result can be believed.
 
     Args:
         real: its truth is a reference that is not exact.
@@ -79,7 +82,7 @@ def subtle_row(name: str, drive: KeptDrive, method: Method, real: bool) -> tuple
     try:
         result = calibrate(drive, drive.nominal, CalibrationConfig(method=method))
     except SstGraphError as error:
-        return f"refused | | | {error}", True
+        return ("refused", "", "", str(error)), True
     first = result.reasons[0] if result.reasons else ""
     assert drive.truth is not None
     late_s = result.time_offset_s - (drive.truth.time_offset_s or 0.0)
@@ -92,22 +95,35 @@ def subtle_row(name: str, drive: KeptDrive, method: Method, real: bool) -> tuple
     )
     believed = result.status != "ok" or sigmas <= MOST_SIGMAS
     believed = believed and SUBTLE_NAMED.get(name, "") in first
-    return f"{result.status} | {sizes} | {sigmas:.1f} | {first}", believed
+    return (result.status, sizes, f"{sigmas:.1f}", first), believed
 
 
-def try_subtle(args: argparse.Namespace) -> None:
-    """Print the table of faults that leave a drive plausible."""
-    right, total = 0, 0
+def subtle_rows(args: argparse.Namespace, right: list[bool]) -> Iterator[Sequence[str]]:
+    """Rows of faults that leave a drive plausible; whether each is as it should be goes to ``right``."""
     for name, drive, _, _ in drives(args):
         real = name not in map(str, args.seeds)
         if real and drive.truth is not None:
             drive = replace(drive, nominal=drive.truth.cTl.retract(START))
         for fault in args.faults or (CLEAN, *SUBTLE_FAULTS):
             wrong = drive if fault == CLEAN else SUBTLE_FAULTS[fault](drive)
-            text, believed = subtle_row(fault, wrong, args.method, real)
-            right, total = right + believed, total + 1
-            print(f"{name} | {fault} | {'yes' if believed else 'NO'} | {text}", flush=True)
-    print(f"{right} of {total} as they should be")
+            cells, believed = subtle_row(fault, wrong, args.method, real)
+            right.append(believed)
+            yield name, fault, "yes" if believed else "**no**", *cells
+
+
+def rows(args: argparse.Namespace, right: list[bool]) -> Iterator[Sequence[str]]:
+    """Rows of mistakes; whether each is as it should be goes to ``right``."""
+    for name, drive, other, beside in drives(args):
+        for fault in args.faults:
+            if fault == RIGHT and beside is None:
+                continue
+            wrong = (
+                drive if fault == CLEAN else beside if fault == RIGHT else INPUT_FAULTS[fault](drive, other)
+            )
+            assert wrong is not None
+            cells, as_it_should = row(fault, wrong, args.quick)
+            right.append(as_it_should)
+            yield name, fault, "yes" if as_it_should else "**no**", *cells
 
 
 def drives(args: argparse.Namespace) -> Iterator[tuple[str, KeptDrive, KeptDrive, KeptDrive | None]]:
@@ -136,23 +152,13 @@ def main() -> None:
     parser.add_argument("--method", default="joint", help="of --subtle: joint or edges")
     parser.add_argument("--faults", nargs="*", default=[])
     args = parser.parse_args()
-    if args.subtle:
-        try_subtle(args)
-        return
-    args.faults = args.faults or [CLEAN, *INPUT_FAULTS, RIGHT]
-    right, total = 0, 0
-    for name, drive, other, beside in drives(args):
-        for fault in args.faults:
-            if fault == RIGHT and beside is None:
-                continue
-            wrong = (
-                drive if fault == CLEAN else beside if fault == RIGHT else INPUT_FAULTS[fault](drive, other)
-            )
-            assert wrong is not None
-            text, as_it_should = row(fault, wrong, args.quick)
-            right, total = right + as_it_should, total + 1
-            print(f"{name} | {fault} | {'yes' if as_it_should else 'NO'} | {text}", flush=True)
-    print(f"{right} of {total} as they should be")
+    if not args.subtle and not args.faults:
+        args.faults = [CLEAN, *INPUT_FAULTS, RIGHT]
+    right: list[bool] = []
+    head, found = (SUBTLE_HEAD, subtle_rows) if args.subtle else (HEAD, rows)
+    for line in lines(head, found(args, right)):
+        print(line, flush=True)
+    print(f"\n{sum(right)} of {len(right)} are as they should be.")
 
 
 if __name__ == "__main__":

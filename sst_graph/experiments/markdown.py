@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,10 +11,17 @@ NONE = "–"
 """In the cell of a number that there is not."""
 
 
+def lines(head: str, rows: Iterable[Sequence[str]]) -> Iterator[str]:
+    """The lines of a table by its first, "| a | b |", and the cells of each row, as the rows come."""
+    yield head
+    yield "|" + "---|" * (head.count("|") - 1)
+    for cells in rows:
+        yield "| " + " | ".join(cells) + " |"
+
+
 def table(head: str, rows: Iterable[Sequence[str]]) -> str:
     """A table by its first line, "| a | b |", and the cells of each row."""
-    lines = [head, "|" + "---|" * (head.count("|") - 1)]
-    return "\n".join([*lines, *("| " + " | ".join(cells) + " |" for cells in rows)]) + "\n"
+    return "\n".join(lines(head, rows)) + "\n"
 
 
 def median(values: Sequence[float], digits: int, unit: str = "") -> str:
