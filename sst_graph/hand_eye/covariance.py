@@ -2,8 +2,9 @@
 some error.
 
 A scan and an image end one pair and begin the next, so scores of neighbours are correlated: they are
-summed with falling weights (Bartlett's kernel: Newey & West, Econometrica 1987), with the usual correction
-for few pairs (Cameron & Miller, A practitioner's guide to cluster-robust inference, 2015, sec. VI.B).
+summed with falling weights (Bartlett's kernel: Newey & West, Econometrica 1987). Of few pairs such a sum is
+too small and uncertain: it is enlarged so that 1.96 of its sigmas hold 95 % of the errors (Kiefer &
+Vogelsang, Econometric Theory 2005, table 1).
 An error that all pairs share, such as that of the principal point, does not show in the residuals: it is
 given by :class:`MotionErrors`. Of the rotation, no more counts as known than both sensors saw.
 """
@@ -70,7 +71,7 @@ def hand_eye_covariance(
     """
     # 1. The information, less what noise seems to bring.
     J, r = terms.linearized(state)
-    cameras, directed = terms.pairs.cameras, terms.residuals.directed
+    cameras = terms.pairs.cameras
     by_noise = NOISE_INFORMATION_MARGIN * _noise_information(terms)
     whitener, model = _whitener(hessian), np.einsum("nki,nkj->ij", J, J)
     bread = _inverse_without(whitener, by_noise)
@@ -82,8 +83,7 @@ def hand_eye_covariance(
     shared = np.zeros((7, 6))
     shared[:, :3] = np.radians(errors.turn_rate_deg_s) * np.tensordot(seconds, moved[:, :, :3], 1)
     shared[:, 3:] = np.radians(errors.direction_deg) * moved[:, :, 3:].sum(axis=0)
-    residuals = int(np.where(directed, 5, 3).sum())
-    excess = _excess(scores, model, _breaks(cameras), residuals)
+    excess = _excess(scores, model, _breaks(cameras))
     covariance = _sandwich(bread, excess) + bread @ shared @ shared.T @ bread
     # 3. The rotation is known no better than by what both sensors saw. The offset is: twists are measured by
     # the LiDAR alone, and their noise is in step 1.
@@ -182,7 +182,7 @@ def _breaks(cameras: Sequence[CameraStep]) -> NDArray[np.bool_]:
     return np.array([True] + [a.drive != b.drive or a.to_ns != b.from_ns for a, b in pairwise(cameras)])
 
 
-def _excess(scores: FloatArray, model: FloatArray, breaks: NDArray[np.bool_], residuals: int) -> FloatArray:
+def _excess(scores: FloatArray, model: FloatArray, breaks: NDArray[np.bool_]) -> FloatArray:
     """(7, 7) by which the scores' own long-run variance exceeds the model's, or falls short of it.
 
     An error of an image or a scan makes the turn before it too large and the next one too small.
@@ -191,7 +191,6 @@ def _excess(scores: FloatArray, model: FloatArray, breaks: NDArray[np.bool_], re
         scores: (n, 7) of the pairs.
         model: (7, 7) their variance if the model holds.
         breaks: (n,) where a pair does not go on where the one before ended.
-        residuals: number of independent residuals behind the scores.
     """
     run = np.cumsum(breaks)
     total = scores.T @ scores
@@ -199,6 +198,14 @@ def _excess(scores: FloatArray, model: FloatArray, breaks: NDArray[np.bool_], re
         same = run[lag:] == run[:-lag]
         product = (scores[lag:][same]).T @ scores[:-lag][same]
         total += (1.0 - lag / (_LAGS + 1.0)) * (product + product.T)
-    pairs, unknowns = len(scores), len(model)
-    total *= pairs / max(pairs - 1, 1) * (residuals - 1) / max(residuals - unknowns, 1)
-    return np.asarray(total - model)
+    return np.asarray(few_pairs_factor(len(scores)) * total - model)
+
+
+def few_pairs_factor(pairs: int) -> float:
+    """By what the variance by the scores of so many pairs is enlarged.
+
+    The critical value of 5 % of a t-statistic whose variance is summed with Bartlett's weights over a share b
+    of the sample, over that of a known variance, squared: the cubic in b of Kiefer & Vogelsang, table 1.
+    """
+    b = min(1.0, (_LAGS + 1.0) / pairs)
+    return float((np.polyval([-0.5324, 0.4160, 2.9694, 1.9600], b) / 1.96) ** 2)
