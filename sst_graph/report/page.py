@@ -189,7 +189,7 @@ def _next(inspection: Inspection) -> str:
     short = [as_sentence(capitalized(reason)) for reason in short_reasons(result)]
     trusted = result.status != "not_converged"
     named = any(inspection.weakest.sentence in reason for reason in [*result.reasons, *weak])
-    plan = inspection.plan if trusted else None
+    plan = inspection.plan
     advice = [] if plan is None else advice_sentences(inspection, plan)
     return section(
         "next",
