@@ -1,7 +1,7 @@
 """Calibration by edges on streets of two simulators and on real drives: errors, sigmas, NEES. Prints a table.
 
     OMP_NUM_THREADS=1 python -m studies.edges_streets                 six streets of each simulator
-    OMP_NUM_THREADS=1 python -m studies.edges_streets own-504 third-900 ../shared/data/DRIVE
+    OMP_NUM_THREADS=1 python -m studies.edges_streets own-504 third-900 DRIVE
 
 Starts are within 4.4 deg and 10 cm by axis. Errors are in the LiDAR's axes: roll, pitch, yaw; forward, left,
 up. Real drives are read with ``--image-shift 1``; their reference is taken for exact. Reasons go to stderr.

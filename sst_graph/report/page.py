@@ -272,7 +272,7 @@ def _close_ups(inputs: ReportInputs, fit: Fit, reader: DriveReader) -> str:
         hint = (_EDGES_NOT_USED if inputs.result.fit_is_check else _EDGES_USED) + _EDGES_HINT
     if not figures:
         return ""
-    name, title = _named(inputs.result, fit, "objects", "Telling objects")
+    name, title = _named(inputs.result, fit, "objects", "Close-ups of objects")
     return section(name, title, paragraph(hint), grid(figures, "large"))
 
 

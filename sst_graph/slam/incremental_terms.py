@@ -92,6 +92,9 @@ class IncrementalTerms:
     def __init__(self, solver: Solver, keys: AlignmentKeys, config: RematchConfig | None = None) -> None:
         """solver: yours; all later updates go through :meth:`update`. keys: those of the terms.
 
+        Relinearize at every update and from small steps on: ``relinearizeSkip = 1`` and a threshold of 1e-4
+        [rad, m, s]. With gtsam's default, 0.1, the estimate stops early and its covariance is wrong.
+
         Raises:
             FactorError: no solver, no keys.
             ConfigError: no settings.
