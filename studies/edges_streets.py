@@ -36,8 +36,8 @@ HEAD = (
 
 
 def source_of(name: str) -> Source:
-    """A street ``own-SEED``, ``wide-SEED`` (as ``sst-graph simulate`` makes it) or ``third-SEED``, or the drive
-    in a folder."""
+    """A street ``own-SEED``, ``wide-SEED`` (24 frames of ``sst-graph simulate``) or ``third-SEED``, or the
+    drive in a folder."""
     kind, _, seed = name.partition("-")
     if kind not in ("own", "third", "wide"):
         return open_source(name, image_shift=1)
