@@ -32,8 +32,12 @@ MIN_OVER_OTHER = 1.08
 MAX_MOTION_CHI2 = 33.0
 """Chi-squared, of 4 (rotation and time offset), of the difference from motion beyond which the two
 contradict."""
-_FLOOR = np.array([*np.radians([0.5] * 3), 0.005])
-"""Added to the sigmas of that difference [rad, s]."""
+_FLOOR = np.array([*np.radians([0.1] * 3), 0.005])
+"""Added to the sigmas of that difference [rad, s]: with it, 1.2 deg of pitch or yaw contradict a motion that
+knows them to 0.1 deg. The two differ by up to 0.11 deg on the KITTI drives; a false optimum in a forest lies
+1.2 deg away from motion."""
+_FLOOR_OF_MISFIT = np.array([*np.radians([0.5] * 3), 0.005])
+"""The same for a motion that does not fit itself, whose covariance says less."""
 _SETTLED_STEP = np.array([*np.radians([0.1] * 3), 0.025, 0.025, 0.025, 0.015])
 """(7,) farther apart, two solutions are not one optimum [rad, m, s]: right ones came back to within 0.01 deg,
 a false one ended 0.4 deg away."""
@@ -118,7 +122,8 @@ def edges_reasons(
     reasons += contrast_reasons(contrast)
     if motion is not None:
         step = difference(motion.state, solution.state)[[0, 1, 2, 6]]
-        total = (motion.covariance + covariance)[np.ix_([0, 1, 2, 6], [0, 1, 2, 6])] + np.diag(_FLOOR**2)
+        floor = _FLOOR if motion.misfit is None else _FLOOR_OF_MISFIT
+        total = (motion.covariance + covariance)[np.ix_([0, 1, 2, 6], [0, 1, 2, 6])] + np.diag(floor**2)
         chi2 = float(step @ np.linalg.solve(total, step))
         if chi2 > MAX_MOTION_CHI2:
             why = "" if motion.misfit is None else f" ({motion.misfit})"

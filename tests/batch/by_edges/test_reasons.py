@@ -2,7 +2,20 @@
 
 from __future__ import annotations
 
-from sst_graph.batch.by_edges.reasons import EdgeContrast, contrast_reasons, with_lens_reasons
+from types import SimpleNamespace
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+
+from sst_graph.batch.by_edges.reasons import (
+    EdgeContrast,
+    contrast_reasons,
+    edges_reasons,
+    with_lens_reasons,
+)
+from sst_graph.graph.state import State
 
 LENS = ("the pictures look distorted: k1 = -0.1 ± 0.017",)
 
@@ -19,3 +32,17 @@ def test_a_pose_that_may_be_wrong_altogether_is_said_before_its_lens() -> None:
     ):
         reasons = tuple(contrast_reasons(doubtful))
         assert len(reasons) == 1 and with_lens_reasons(reasons, LENS, doubtful) == (*reasons, *LENS)
+
+
+@pytest.mark.parametrize(("pitch_deg", "contradicts"), [(0.3, False), (0.7, False), (1.5, True)])
+def test_a_pitch_that_motion_knows_better_is_contradicted(pitch_deg: float, contradicts: bool) -> None:
+    """Motion knows pitch to 0.1 deg, the estimate claims 0.16 deg; of roll it knows little."""
+    truth = State(gtsam.Pose3(), (0.05,))
+    step = np.array([*np.radians([3.0, pitch_deg, 0.0]), 0.0, 0.0, 0.0, 0.0])
+    sigmas = np.array([*np.radians([3.0, 0.1, 0.1]), 0.3, 0.3, 0.3, 0.003])
+    motion: Any = SimpleNamespace(state=truth, covariance=np.diag(sigmas**2), misfit=None)
+    own = np.diag(np.array([*np.radians([0.16] * 3), 0.02, 0.02, 0.02, 0.004]) ** 2)
+    solution: Any = SimpleNamespace(state=truth.moved(step), converged=True)
+    right = EdgeContrast(score=500.0, sigmas=12.0, ratio=2.0, other=300.0)
+    reasons = edges_reasons(solution, right, motion, own, truth)
+    assert any("motion alone gives another calibration" in reason for reason in reasons) == contradicts
