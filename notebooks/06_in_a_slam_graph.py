@@ -168,6 +168,7 @@ figure.tight_layout()
 # %%
 parameters = gtsam.ISAM2Params()
 parameters.relinearizeSkip = 1
+parameters.setRelinearizeThreshold(1e-4)  # the default, 0.1 (rad, m, s), is far too coarse here
 trajectory = Trajectory()
 online = IncrementalTerms(gtsam.ISAM2(parameters), AlignmentKeys(trajectory, E(0), D(0)))
 history = []

@@ -1,7 +1,7 @@
 """Calibration by edges on streets of two simulators and on real drives: errors, sigmas, NEES. Prints a table.
 
     OMP_NUM_THREADS=1 python -m studies.edges_streets                 six streets of each simulator
-    OMP_NUM_THREADS=1 python -m studies.edges_streets own-504 third-900 ../shared/data/DRIVE
+    OMP_NUM_THREADS=1 python -m studies.edges_streets own-504 third-900 DRIVE
 
 Starts are within 4.4 deg and 10 cm by axis. Errors are in the LiDAR's axes: roll, pitch, yaw; forward, left,
 up. Real drives are read with ``--image-shift 1``; their reference is taken for exact. Reasons go to stderr.
@@ -36,12 +36,15 @@ HEAD = (
 
 
 def source_of(name: str) -> Source:
-    """A street ``own-SEED`` or ``third-SEED``, or the drive in a folder."""
+    """A street ``own-SEED``, ``wide-SEED`` (24 frames of ``sst-graph simulate``) or ``third-SEED``, or the
+    drive in a folder."""
     kind, _, seed = name.partition("-")
-    if kind not in ("own", "third"):
+    if kind not in ("own", "third", "wide"):
         return open_source(name, image_shift=1)
     number = int(seed)
     offset_s = OFFSETS_S[number % 3]
+    if kind == "wide":
+        return simulate(SimulationConfig(seed=number, frames=24, azimuth_limit_deg=60.0))
     if kind == "own":
         motion = ("no_stop", "stop_and_go", "mixed", "turning")[number % 4]
         return simulate(
@@ -93,13 +96,16 @@ def short(name: str) -> str:
     return f"`{Path(name).name}`"
 
 
-def rows(names: Sequence[str], found: list[tuple[FloatArray, float]]) -> Iterator[Sequence[str]]:
+def rows(
+    names: Sequence[str], guessed: bool, found: list[tuple[FloatArray, float]]
+) -> Iterator[Sequence[str]]:
     """A row a drive; errors and NEES go to ``found``."""
     for name in names:
         source = source_of(name)
         truth, began = source.truth, time.process_time()
         assert truth is not None
-        result = calibrate(source, truth.cTl.retract(start_step(name)), CalibrationConfig(method="edges"))
+        start = truth.cTl.retract(start_step(name)) if guessed else None
+        result = calibrate(source, start, CalibrationConfig(method="edges"))
         seconds = time.process_time() - began
         error = error_of(result.T_camera_lidar, result.time_offset_s, truth)
         nees = nees_of(error, result.covariance)
@@ -113,8 +119,10 @@ def rows(names: Sequence[str], found: list[tuple[FloatArray, float]]) -> Iterato
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("names", nargs="*", default=STREETS)
+    parser.add_argument("--no-guess", action="store_true", help="start from motion alone")
+    args = parser.parse_args()
     found: list[tuple[FloatArray, float]] = []
-    for line in lines(HEAD, rows(parser.parse_args().names, found)):
+    for line in lines(HEAD, rows(args.names, not args.no_guess, found)):
         print(line, flush=True)
     errors, nees = np.array([error for error, _ in found]), np.array([each for _, each in found])
     rotation, shift = np.linalg.norm(errors[:, :3], axis=1), np.abs(errors[:, 3:6]).mean(axis=1)

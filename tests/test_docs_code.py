@@ -132,6 +132,11 @@ def test_a_calibration_in_your_own_graph(tmp_path: Path) -> None:
     assert (np.abs([*apart, late]) < 4.0 * sigmas).all()
     start = truth.cTl.localCoordinates(found["drive"].nominal)
     assert np.linalg.norm(apart[:3]) < 0.25 * np.linalg.norm(start[:3]) and abs(late) < 0.01
+    update = found["update"]  # iSAM2's, of the same drive
+    between = solution.values.atPose3(found["E"](0)).localCoordinates(update.values.atPose3(found["E"](0)))
+    later = update.values.atVector(found["D"](0))[0] - solution.values.atVector(found["D"](0))[0]
+    assert update.converged and (np.abs([*between, later]) < 0.5 * sigmas).all()
+    np.testing.assert_allclose(np.sqrt(np.diag(update.covariance)), sigmas, rtol=0.5)
     factor, by_hand = found["factor"], found["matches"]
     assert len(by_hand) > 50 and factor.error(solution.values) < len(by_hand)
 

@@ -47,7 +47,7 @@ def main() -> None:
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"{', '.join(known)} (default: all)")
     parser.add_argument("--measure", action="store_true", help="calibrate the drives of drives.csv first")
     parser.add_argument("--demo", type=Path, metavar="DIR", help="take the pictures of this demo")
-    parser.add_argument("--into", type=Path, default=HERE, metavar="DIR")
+    parser.add_argument("--into", type=Path, default=HERE, metavar="DIR", help="folder for the figures")
     args = parser.parse_args()
     unknown = set(args.names) - set(known)
     if unknown:

@@ -27,6 +27,7 @@ from sst_graph.covariance.broken_assumptions import Evidence, considered_sigmas
 from sst_graph.covariance.cluster_robust import RobustCovariance, covariance_of, robust_covariance
 from sst_graph.covariance.considered import AssumptionConfig, Considered
 from sst_graph.covariance.error_model import fit_error_model
+from sst_graph.covariance.image_shifts import columns_by_image, shifts_of
 from sst_graph.covariance.match_table import MatchTable, match_table
 from sst_graph.covariance.observability import weak_directions
 from sst_graph.errors import EstimationError
@@ -36,7 +37,7 @@ from sst_graph.graph.linear import scaled_inverse
 from sst_graph.graph.outer_loop import JointSolution, explained, solve_joint
 from sst_graph.graph.state import State, nuisance_key
 from sst_graph.objects.tracks import ObjectId
-from sst_graph.types import FloatArray
+from sst_graph.types import FloatArray, IntArray
 
 _LOG = logging.getLogger(__name__)
 
@@ -174,6 +175,7 @@ class LinearProblem:
         information: (n, n) of the unknowns, motion marginalised out, priors included.
         values: of the free parameters at the optimum, by name.
         state: the optimum.
+        by_image: derivatives of the residuals by shifts of their image, and its number.
     """
 
     table: MatchTable
@@ -181,6 +183,7 @@ class LinearProblem:
     information: FloatArray
     values: dict[str, float]
     state: State
+    by_image: tuple[FloatArray, IntArray]
 
     @classmethod
     def of(cls, problem: SolvedProblem, names: Sequence[str]) -> LinearProblem:
@@ -193,7 +196,9 @@ class LinearProblem:
         table = match_table(eliminated, at, pairs, solution.frozen.state, problem.objects)
         information = scaled_inverse(eliminated.covariance())
         state = state_from(at, solution.state, pairs)
-        return cls(table, unknowns, information, {name: state.nuisances[name] for name in names}, state)
+        free = {name: state.nuisances[name] for name in names}
+        by_image = columns_by_image(table, pairs, at, state)
+        return cls(table, unknowns, information, free, state, by_image)
 
     def alone(self, name: str, config: AssumptionConfig) -> ParameterTest:
         """Estimate of one parameter while the others of them are zero."""
@@ -203,7 +208,8 @@ class LinearProblem:
         covariance = covariance_of(bread, table, fit_error_model(table.residuals))
         column = self.unknowns.column(nuisance_key(name))
         place = int(np.searchsorted(kept, column))
-        sigma = float(np.sqrt(covariance[place, place]))
+        by_image = shifts_of(table, bread[place : place + 1], *self.by_image).covariance[0, 0]
+        sigma = float(np.sqrt(covariance[place, place] + by_image))
         sigma *= few_objects_factor(int(table.objects.max()) + 1, config.threshold)
         value = self.values[name] + float(step[column])
         return ParameterTest.of(ASSUMPTIONS[name], value, sigma, config.threshold)
@@ -262,7 +268,10 @@ def _solved_alone(
         solution.graph, solution.values, solution.pairs, solution.state, problem.objects
     )
     column = robust.unknowns.column(nuisance_key(name))
-    value, sigma = solution.state.nuisances[name], float(np.sqrt(robust.matrix[column, column]))
+    by_image = columns_by_image(robust.table, solution.pairs, solution.values, solution.state)
+    shifts = shifts_of(robust.table, robust.bread[column : column + 1], *by_image)
+    value = solution.state.nuisances[name]
+    sigma = float(np.sqrt(robust.matrix[column, column] + shifts.covariance[0, 0]))
     sigma *= few_objects_factor(int(robust.table.objects.max()) + 1, config.threshold)
     return ParameterTest.of(finding.assumption, value, sigma, config.threshold)
 

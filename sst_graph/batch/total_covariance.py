@@ -37,7 +37,7 @@ class TotalCovariance:
         budget: sigmas (7) by each part, JSON-able.
         reasons: sweeps that nothing decides and that matter.
         by_sweeps: (7, 7) part of it by sweeps that the scans leave undecided.
-        shifts: of the pictures from image to image.
+        shifts: of the pictures and their stamps from image to image.
     """
 
     unknowns: FloatArray
@@ -50,9 +50,8 @@ class TotalCovariance:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """That the pictures shift, where it matters."""
-        sentence = self.shifts.sentence(self.covariance)
-        return (sentence,) if sentence else ()
+        """That pictures shift and stamps jitter, where it matters."""
+        return self.shifts.sentences(self.covariance)
 
 
 def total_covariance(

@@ -18,7 +18,7 @@ from sst_graph.errors import ConfigError, SstGraphError, printable
 
 _LOG = logging.getLogger(__name__)
 _LONGEST = 390
-"""Characters of what was said elsewhere."""
+"""Characters of what was said elsewhere, or of a place that the system names."""
 
 
 def run(argv: Sequence[str], own_process: bool = False) -> int:
@@ -41,7 +41,7 @@ def run(argv: Sequence[str], own_process: bool = False) -> int:
     except KeyboardInterrupt:
         return _failed("interrupted", EXIT_INTERRUPTED)
     except OSError as error:
-        return _failed(_sentence(error), EXIT_BAD_INPUT)
+        return _failed(printable(_sentence(error), _LONGEST), EXIT_BAD_INPUT)
     except SstGraphError as error:
         return _failed(str(error), EXIT_BAD_INPUT)
     except MemoryError as error:

@@ -1,12 +1,11 @@
-"""Pictures that shift against the cloud from one image to the next, and what that adds to a covariance.
+"""Errors that all matches of an image share, others in the next image, and what they add to a covariance.
 
-A mount that vibrates, pictures that are stabilised, or stamps that jitter move all contours of an image
-alike, by another amount in the next image. Neighbouring objects then err together, which the error model of
-single sides (:mod:`sst_graph.covariance.error_model`) does not know. The matches of each image are fitted
-with a shift of its picture; what the shifts vary by beyond their own variances is the variance s^2 of the
-picture, across and down (random effects: DerSimonian and Laird, Meta-analysis in clinical trials, 1986). With
-J_k and H_k the rows of image k by the unknowns and by its shift, and P the inverse of the information, it
-adds
+A mount that vibrates or pictures that are stabilised move all contours of an image alike, stamps that jitter
+move each point by its own motion. Neighbouring objects then err together, which the error model of single
+sides (:mod:`sst_graph.covariance.error_model`) does not know. The matches of each image are fitted with a
+shift of its picture and of its stamp; what these vary by beyond their own variances is their variance s^2
+(random effects: DerSimonian and Laird, Meta-analysis in clinical trials, 1986). With J_k and H_k the rows of
+image k by the unknowns and by its shifts, and P the inverse of the information, they add
 
     sum_k P J_k'H_k diag(s^2) H_k'J_k P.
 """
@@ -29,34 +28,53 @@ from sst_graph.graph.matching import PairMatches
 from sst_graph.graph.state import State
 from sst_graph.types import FloatArray, IntArray
 
-_LEAST_SIDES = 4
-"""Fewest sides of objects in an image that its shift (2 numbers) is fitted to: with fewer, its variance
-cannot be told from the sides' scatter."""
+_LEAST_SIDES = 2
+"""Fewest sides of objects in an image beyond the number of its shifts: with fewer, their variance cannot be
+told from the sides' scatter."""
+_UNITS = np.array([1.0, 1.0, 1e-3])
+"""Pixels and milliseconds: variances are compared in these."""
+_WIDEST_STAMP_S = 0.1
+"""An image's stamp that its matches determine worse than this (the vehicle stands) is not fitted [s]."""
 
 
 @dataclass(frozen=True)
 class ImageShifts:
-    """How the pictures of a calibration shift from image to image.
+    """How the pictures of a calibration shift from image to image, and their stamps.
 
     Attributes:
-        sigmas_px: (2,) deviation of the shift across and down [px].
-        covariance: (s, s) of extrinsic and offsets by it.
+        sigmas: (3,) deviation of the shift across and down [px] and of the stamp [s].
+        parts: (3, s, s) covariance of extrinsic and offsets by each.
     """
 
-    sigmas_px: FloatArray
-    covariance: FloatArray
+    sigmas: FloatArray
+    parts: FloatArray
 
-    def sentence(self, covariance: FloatArray) -> str:
-        """That the pictures shift, where it makes up much of a covariance (7, 7); else empty."""
-        shares = np.sqrt(np.diag(self.covariance)[:7] / np.diag(covariance))
-        if shares.max() <= MATTERS:
-            return ""
-        across, down = self.sigmas_px
-        return (
-            f"the pictures shift against the cloud from image to image, by {across:.1f} px across and "
-            f"{down:.1f} px up or down (one sigma): look for a mount that vibrates, pictures that are "
-            "stabilised, or stamps that jitter; it is in the sigmas"
+    @property
+    def covariance(self) -> FloatArray:
+        """(s, s) of extrinsic and offsets by all of them."""
+        return np.asarray(self.parts.sum(axis=0))
+
+    def sentences(self, covariance: FloatArray) -> tuple[str, ...]:
+        """That the pictures shift, and that their stamps jitter, where it makes up much of a covariance
+        (7, 7)."""
+        of_picture, of_stamp = (
+            np.sqrt(np.diag(part)[:7] / np.diag(covariance)).max() > MATTERS
+            for part in (self.parts[:2].sum(axis=0), self.parts[2])
         )
+        across, down, late_s = self.sigmas
+        found = []
+        if of_stamp:
+            found.append(
+                f"the stamps of the images jitter by {1e3 * late_s:.1f} ms (one sigma): stamp them by their "
+                "trigger or exposure, not by their arrival; it is in the sigmas"
+            )
+        if of_picture:
+            found.append(
+                f"the pictures shift against the cloud from image to image, by {across:.1f} px across and "
+                f"{down:.1f} px up or down (one sigma): look for a mount that vibrates, or pictures that are "
+                "stabilised; it is in the sigmas"
+            )
+        return tuple(found)
 
 
 def image_shifts(
@@ -68,20 +86,35 @@ def image_shifts(
         robust: its covariance and matches.
         pairs, values, state: its last frozen problem.
     """
-    H = weighted_columns(robust.table, pairs, columns_of(pairs, values, state, ("cx", "cy")))
+    size = 6 + len(state.time_offsets_s)
+    return shifts_of(robust.table, robust.bread[:size], *columns_by_image(robust.table, pairs, values, state))
+
+
+def columns_by_image(
+    table: MatchTable, pairs: Sequence[PairMatches], values: gtsam.Values, state: State
+) -> tuple[FloatArray, IntArray]:
+    """Derivatives of the residuals by a shift of their picture (2) and of its stamp, and numbers of images.
+
+    Args:
+        table: the matches.
+        pairs, values, state: the frozen problem that they are of.
+    """
+    of_picture = weighted_columns(table, pairs, columns_of(pairs, values, state, ("cx", "cy")))
+    # A match has one drive's offset.
+    of_stamp = table.J[:, 6 : 6 + len(state.time_offsets_s)].sum(axis=1)
     numbers: dict[tuple[int, int], int] = {}
     of_pair = [numbers.setdefault((pair.drive, pair.pair.image), len(numbers)) for pair in pairs]
-    images = np.repeat(of_pair, [len(pair) for pair in pairs])
-    return shifts_of(robust.table, robust.bread[: 6 + len(state.time_offsets_s)], H, images)
+    return np.column_stack([of_picture, of_stamp]), np.repeat(of_pair, [len(pair) for pair in pairs])
 
 
 def shifts_of(table: MatchTable, bread: FloatArray, H: FloatArray, images: IntArray) -> ImageShifts:
-    """The shifts of the pictures, and what they add to the covariance.
+    """The shifts of pictures and stamps, and what they add to the covariance.
 
     Args:
         table: the matches.
         bread: (s, n) inverse of the information, rows of those unknowns whose covariance is wanted.
-        H: (m, 2) derivatives of the residuals by a shift of the picture, weighted [1/px].
+        H: (m, 3) derivatives of the residuals by a shift of the picture and of its stamp, weighted
+            [1/px, 1/px, 1/s].
         images: (m,) number of the image.
     """
     order = np.argsort(images, kind="stable")
@@ -92,18 +125,18 @@ def shifts_of(table: MatchTable, bread: FloatArray, H: FloatArray, images: IntAr
     variances = _variances([fit for fit in fits if fit is not None])
     # 2. What it does to the estimate.
     effects = [bread @ (table.J[own].T @ H[own]) for own in members]
-    covariance = sum(((G * variances) @ G.T for G in effects), np.zeros((len(bread), len(bread))))
-    return ImageShifts(np.sqrt(variances), np.asarray(covariance))
+    parts = [sum(np.outer(G[:, k], G[:, k]) for G in effects) * variances[k] for k in range(3)]
+    return ImageShifts(np.sqrt(variances), np.array(parts))
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """The shift of one picture [px].
+    """The shifts of one picture [px, px] and of its stamp [s]; infinite variances where it is not fitted.
 
     Attributes:
-        shift: (2,) across, down.
-        independent: (2,) its variances if all matches erred by themselves.
-        by_sides: (2,) the same from the scatter of the sides of objects.
+        shift: (3,) across, down, later.
+        independent: (3,) variances if all matches erred by themselves.
+        by_sides: (3,) the same from the scatter of the sides of objects.
     """
 
     shift: FloatArray
@@ -112,36 +145,53 @@ class _Fit:
 
 
 def _fitted(H: FloatArray, r: FloatArray, sides: IntArray) -> _Fit | None:
-    """The shift by the matches of one image; None where they do not determine it.
+    """The shifts by the matches of one image, of the picture alone where they do not determine the stamp's;
+    None where they determine neither.
 
     Args:
-        H: (m, 2) derivatives of the residuals, weighted.
+        H: (m, 3) derivatives of the residuals, weighted.
         r: (m,) residuals, weighted.
         sides: (m,) numbers of the sides of objects.
     """
-    information = H.T @ H
-    if np.linalg.matrix_rank(information, hermitian=True) < 2:
-        return None
-    inverse = np.linalg.inv(information)
-    shift = inverse @ (H.T @ r)
-    names, scores = summed_rows(H * (r - H @ shift)[:, None], sides)
-    if len(names) < _LEAST_SIDES:
-        return None
-    scores = scores @ inverse * np.sqrt(len(names) / (len(names) - 2.0))
-    return _Fit(shift, np.diag(inverse), (scores**2).sum(axis=0))
+    for used in (3, 2):
+        own = H[:, :used]
+        scale = 1.0 / np.maximum(np.linalg.norm(own, axis=0), 1e-12)
+        information = (own * scale).T @ (own * scale)
+        if np.linalg.matrix_rank(information, hermitian=True) < used:
+            continue
+        inverse = np.linalg.inv(information) * np.outer(scale, scale)
+        if used == 3 and inverse[2, 2] > _WIDEST_STAMP_S**2:
+            continue
+        shift = inverse @ (own.T @ r)
+        names, scores = summed_rows(own * (r - own @ shift)[:, None], sides)
+        if len(names) < used + _LEAST_SIDES:
+            continue
+        scores = scores @ inverse * np.sqrt(len(names) / (len(names) - used))
+        found = np.stack([shift, np.diag(inverse), (scores**2).sum(axis=0)])
+        return _Fit(*np.pad(found, ((0, 0), (0, 3 - used)), constant_values=np.inf))
+    return None
 
 
 def _variances(fits: Sequence[_Fit]) -> FloatArray:
-    """(2,) variances of the shifts across and down beyond those of their fits [px^2]; 0 of a single image.
+    """(3,) variances of the shifts beyond those of their fits [px^2, px^2, s^2]; 0 of a single image.
 
     The scatter of one image's few sides tells little: images share the ratio by which it is larger than that
     of independent matches.
     """
-    if len(fits) < 2:
-        return np.zeros(2)
-    shifts, independent, by_sides = (
-        np.array([getattr(fit, name) for fit in fits]) for name in ("shift", "independent", "by_sides")
-    )
-    own = independent * (by_sides.sum(axis=0) / independent.sum(axis=0))
-    together = np.zeros(len(fits), np.intp)
-    return np.array([spread_beyond(shifts[:, k], own[:, k], together) for k in range(2)])
+    found = np.zeros(3)
+    for k in range(3):
+        shift, independent, by_sides = (
+            np.array(
+                [
+                    (fit.shift[k], fit.independent[k], fit.by_sides[k])
+                    for fit in fits
+                    if np.isfinite(fit.shift[k])
+                ]
+            )
+            .reshape(-1, 3)
+            .T
+        )
+        if len(shift) > 1:
+            own = independent * (by_sides.sum() / independent.sum())
+            found[k] = spread_beyond(shift / _UNITS[k], own / _UNITS[k] ** 2, np.zeros(len(own), np.intp))
+    return np.asarray(found * _UNITS**2)

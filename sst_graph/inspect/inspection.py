@@ -144,12 +144,12 @@ def inspect_result(result: CalibrationResult, next_frames: int = 10) -> Inspecti
 
 
 def _plan(result: CalibrationResult, frames: tuple[FrameInformation, ...], next_frames: int) -> Plan | None:
-    """What to record next; None without information by frame.
+    """What to record next; None without information by frame, and of an estimate that is not to be trusted.
 
     Raises:
         DataError: that information is none that a calibration can have.
     """
-    if not frames:
+    if not frames or result.status == "not_converged":
         return None
     try:
         with np.errstate(all="ignore"):

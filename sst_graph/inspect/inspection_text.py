@@ -29,6 +29,7 @@ from sst_graph.types import FloatArray
 
 MOST_SENTENCES = 5
 """Correlations that are put into words."""
+_NO_PLAN = ["what to record next: not predicted, for the estimate is not to be trusted (reason above)"]
 
 
 def inspection_text(inspection: Inspection, all_frames: bool = False) -> str:
@@ -41,10 +42,11 @@ def inspection_text(inspection: Inspection, all_frames: bool = False) -> str:
     ]
     if budget := budget_lines(inspection.result):
         blocks.append(budget)
-    if inspection.plan is None:
-        blocks.append(gained_lines(inspection.result, inspection.gained, all_frames))
+    if inspection.frames:
+        plan = _NO_PLAN if inspection.plan is None else _plan_block(inspection, inspection.plan)
+        blocks += [_frame_block(inspection, all_frames), plan]
     else:
-        blocks += [_frame_block(inspection, all_frames), _plan_block(inspection, inspection.plan)]
+        blocks.append(gained_lines(inspection.result, inspection.gained, all_frames))
     return "\n\n".join("\n".join(line.rstrip() for line in block) for block in blocks)
 
 
@@ -261,8 +263,6 @@ def _plan_block(inspection: Inspection, plan: Plan) -> list[str]:
     lines += [f"- {sentence}" for sentence in advice_sentences(inspection, plan)]
     if inspection.result.drive_offsets:
         lines.append(f"- the offset here is that of {inspection.result.drive_offsets[0].drive}")
-    if inspection.result.status == "not_converged":
-        lines.append("- the estimate itself is not to be trusted: take these figures as rough")
     return lines
 
 

@@ -122,7 +122,7 @@ def _misfit_px(points: PointResiduals) -> float:
 def close_ups(
     fit: Fit, result: CalibrationResult, placements: Callable[[str], Placements], reader: DriveReader
 ) -> list[str]:
-    """Figures of the telling objects; frames that cannot be read are left out.
+    """Figures of the objects that tell most; frames that cannot be read are left out.
 
     Args:
         placements: where the cloud of a drive is drawn, by its name.

@@ -189,7 +189,7 @@ def _next(inspection: Inspection) -> str:
     short = [as_sentence(capitalized(reason)) for reason in short_reasons(result)]
     trusted = result.status != "not_converged"
     named = any(inspection.weakest.sentence in reason for reason in [*result.reasons, *weak])
-    plan = inspection.plan if trusted else None
+    plan = inspection.plan
     advice = [] if plan is None else advice_sentences(inspection, plan)
     return section(
         "next",
@@ -272,7 +272,7 @@ def _close_ups(inputs: ReportInputs, fit: Fit, reader: DriveReader) -> str:
         hint = (_EDGES_NOT_USED if inputs.result.fit_is_check else _EDGES_USED) + _EDGES_HINT
     if not figures:
         return ""
-    name, title = _named(inputs.result, fit, "objects", "Telling objects")
+    name, title = _named(inputs.result, fit, "objects", "Close-ups of objects")
     return section(name, title, paragraph(hint), grid(figures, "large"))
 
 

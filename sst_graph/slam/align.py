@@ -163,6 +163,14 @@ class ScanMotion:
         return CameraTwist(Ad @ self.l_twist, Ad @ self.l_acceleration)
 
 
+def expect_classes(what: str, classes: Sequence[SemanticClass]) -> None:
+    """Refuse what is no sequence of classes."""
+    expected = "a tuple of SemanticClass"
+    checked_type(what, classes, (list, tuple), expected)
+    for c in classes:
+        checked_type(what, c, SemanticClass, expected)
+
+
 @dataclass(frozen=True)
 class FrameMatching:
     """What is matched, and how.
@@ -186,10 +194,7 @@ class FrameMatching:
     config: MatchConfig = SLAM_MATCHES
 
     def __post_init__(self) -> None:
-        expected = "a tuple of SemanticClass"
-        checked_type("classes of FrameMatching", self.classes, (list, tuple), expected)
-        for c in self.classes:
-            checked_type("classes of FrameMatching", c, SemanticClass, expected)
+        expect_classes("classes of FrameMatching", self.classes)
         checked_type("kernel of FrameMatching", self.kernel, RobustKernel, "a sst_graph.factors.RobustKernel")
         object.__setattr__(self, "config", expect_settings(self.config, MatchConfig))
 

@@ -9,7 +9,7 @@ take the place of the old ones. Kernel, proximal prior and the scale of the info
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import gtsam
@@ -40,6 +40,7 @@ from sst_graph.slam.solving import moved_px, proximal, widest_px
 from sst_graph.slam.term_warnings import (
     TermWarning,
     far_from_start,
+    far_linearization,
     last_warnings,
     uncertainty_px,
     wide_uncertainty,
@@ -73,7 +74,7 @@ class IncrementalUpdate:
         converged: the kernel has its last scale, the proximal prior is gone, no term needs matching.
         rematched: how many factors were swapped.
         waiting: terms that have no factor, and why.
-        warnings: what may be wrong.
+        warnings: what may be wrong; of the start, at the first matches and by ``converge``.
     """
 
     values: gtsam.Values
@@ -90,6 +91,9 @@ class IncrementalTerms:
 
     def __init__(self, solver: Solver, keys: AlignmentKeys, config: RematchConfig | None = None) -> None:
         """solver: yours; all later updates go through :meth:`update`. keys: those of the terms.
+
+        Relinearize at every update and from small steps on: ``relinearizeSkip = 1`` and a threshold of 1e-4
+        [rad, m, s]. With gtsam's default, 0.1, the estimate stops early and its covariance is wrong.
 
         Raises:
             FactorError: no solver, no keys.
@@ -109,7 +113,8 @@ class IncrementalTerms:
         self._sides = ObjectSides()
         self._gone = TermSums()
         self._start: tuple[gtsam.Values, FloatArray] | None = None
-        self._begun = False
+        self._start_warnings: list[TermWarning] = []
+        self._begun, self._has_new_terms = False, False
 
     def update(
         self,
@@ -143,10 +148,14 @@ class IncrementalTerms:
         self._begun = True
         self._solve(graph, values, stamps, self._leaving(stamps))
         self._terms += [_Placed(term) for term in terms]
+        self._has_new_terms |= bool(terms)
         return self._rematch(_ROUNDS)
 
     def converge(self, most_rounds: int | None = None) -> IncrementalUpdate:
         """Rounds of matching without anything new, until they change nothing.
+
+        Where terms have come since the last time, the kernel is wide again first: it was narrowed by the
+        first images, which may not tell a shift forward from an image taken later.
 
         Raises:
             FactorError: no number of rounds.
@@ -159,7 +168,10 @@ class IncrementalTerms:
             raise EstimationError(
                 "IncrementalTerms.converge: found no update before it, expected one or more"
             )
-        return self._rematch(rounds)
+        if self._has_new_terms:
+            self._kernel_px, self._held, self._has_new_terms = self._config.first_px, True, False
+        update = self._rematch(rounds)
+        return replace(update, warnings=tuple(dict.fromkeys((*self._start_warnings, *update.warnings))))
 
     # --- rounds
 
@@ -177,6 +189,7 @@ class IncrementalTerms:
             before, estimate = estimate, self._solver.calculateEstimate()
             if alone is not None:
                 first_warnings = wide_uncertainty(self._matches(), before, alone)
+                self._start_warnings = first_warnings
                 self._start, alone = (before, alone), None
             covariance, found, converged = self._anneal(estimate)
             if converged:
@@ -185,6 +198,8 @@ class IncrementalTerms:
         matches = self._matches()
         if matches and self._kernel_px == self._config.last_px:
             warnings = warnings + last_warnings(matches, estimate, covariance, self._config)
+            point = self._solver.getLinearizationPoint()
+            warnings = warnings + far_linearization(self._keys, matches, point, estimate)
             if found is not None:
                 P, cTl = self._marginal()[:7, :7], self._keys.extrinsic(estimate)
                 warnings = warnings + covariance_warnings(P, found, cTl, self._config)

@@ -15,7 +15,7 @@ from sst_graph.features.lidar_edges import with_points
 from sst_graph.objects.dynamic_objects import DynamicObjectTest
 from sst_graph.objects.occupancy import ObjectName
 from sst_graph.objects.tracks import ObjectTracker
-from sst_graph.slam.align import VEHICLES, scan_features_of
+from sst_graph.slam.align import VEHICLES, expect_classes, scan_features_of
 from sst_graph.types import FloatArray, Scan, SemanticClass
 
 
@@ -49,10 +49,11 @@ def follow_objects(
 
     Raises:
         DataError: not one pose for each scan; no scan, or one that has a flaw.
-        FactorError: no scans, no poses.
+        FactorError: no scans, no poses, no classes.
     """
     for name, given in (("scans", scans), ("wTls", wTls)):
         checked_type(f"{name} of follow_objects", given, (list, tuple), "a list, one for each scan")
+    expect_classes("classes of follow_objects", classes)
     for wTl in wTls:
         checked_gtsam("wTls of follow_objects", wTl, gtsam.Pose3)
     if len(scans) != len(wTls):

@@ -19,6 +19,8 @@ from sst_graph.types import FloatArray
 MOST_SIGMAS = 4.3
 """An estimate farther from the start contradicts what was known there: chi-squared of 7 exceeds its square
 once in a hundred [sigma]."""
+MOST_LINEAR_PX = 1.0
+"""An estimate farther than this from where the solver linearized is not what the matches say [px]."""
 
 
 class WarningKind(Enum):
@@ -26,6 +28,7 @@ class WarningKind(Enum):
 
     WIDE_UNCERTAINTY = "the calibration is less certain than the matches reach"
     FAR_FROM_START = "the estimate lies farther from the start than the rest of the graph allows"
+    FAR_LINEARIZATION = "the solver has linearized away from the estimate"
     LEFT_INTERVAL = "stamp + offset has left the interval between its two poses"
     NO_MATCHES = "terms without a factor"
     NOT_CONVERGED = "matching again still moves the matched points"
@@ -104,15 +107,35 @@ def far_from_start(
     """
     if not np.isfinite(covariance).all():
         return []
-    step = np.append(
-        gtsam.Pose3.Logmap(keys.extrinsic(start).between(keys.extrinsic(values))),
-        keys.offset(values) - keys.offset(start),
-    )
     _, whiten = covariance_root(covariance)
-    sigmas = float(np.linalg.norm(whiten @ step))
+    sigmas = float(np.linalg.norm(whiten @ _step(keys, start, values)))
     if sigmas <= MOST_SIGMAS:
         return []
     return [TermWarning(WarningKind.FAR_FROM_START, sigmas, MOST_SIGMAS, "sigma")]
+
+
+def far_linearization(
+    keys: AlignmentKeys, matches: Sequence[TermMatches], point: gtsam.Values, values: gtsam.Values
+) -> list[TermWarning]:
+    """A warning where the solver's linear model of extrinsic and offset was made elsewhere in the image.
+
+    Args:
+        point: the solver's linearization point.
+    """
+    step = _step(keys, point, values)
+    far_px = uncertainty_px(matches, values, np.outer(step, step))
+    if not np.isfinite(far_px) or far_px <= MOST_LINEAR_PX:
+        return []
+    advice = "ISAM2Params: relinearizeSkip = 1, setRelinearizeThreshold(1e-4)"
+    return [TermWarning(WarningKind.FAR_LINEARIZATION, far_px, MOST_LINEAR_PX, "px", advice)]
+
+
+def _step(keys: AlignmentKeys, start: gtsam.Values, values: gtsam.Values) -> FloatArray:
+    """(7,) of extrinsic and offset from one estimate to another [rad, m, s]."""
+    return np.append(
+        gtsam.Pose3.Logmap(keys.extrinsic(start).between(keys.extrinsic(values))),
+        keys.offset(values) - keys.offset(start),
+    )
 
 
 def last_warnings(

@@ -51,12 +51,14 @@ def increment(whole: TrackedMarginal, previous: TrackedMarginal) -> TrackedMargi
     """What to add to a marginal to come to another, about the former's point.
 
     It may be negative in some direction: where later frames show that labels err more than they seemed to,
-    the covariance grows. The sum is the tracker's own information.
+    the covariance grows. The sum is the tracker's own information. Without further frames only rounding is
+    left, which need not be symmetric.
     """
     there = moved_to(whole, previous)
+    more = there.information - previous.information
     return replace(
         there,
-        information=there.information - previous.information,
+        information=0.5 * (more + more.T),
         vector=there.vector - previous.vector,
         constant=there.constant - previous.constant,
     )

@@ -234,6 +234,13 @@ def test_what_nobody_foresaw_is_one_line() -> None:
     assert "at <string>:6 (a defect, please report it with what --verbose says)" in line
 
 
+def test_a_name_that_the_system_refuses_is_shortened() -> None:
+    command = [sys.executable, "-m", "sst_graph", "inspect", "a/" * 3000]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 2 and len(done.stderr) < 500
+    assert done.stderr.startswith("sst-graph: error: a/a/") and "File name too long" in done.stderr
+
+
 def test_the_working_directory_was_removed(tmp_path: Path) -> None:
     program = "import os, sys; os.rmdir(os.getcwd()); from sst_graph.cli import main; sys.exit(main())"
     (tmp_path / "gone").mkdir()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import struct
 import time
 from pathlib import Path
@@ -251,6 +252,17 @@ def test_a_broken_file_is_one_line(tmp_path: Path, name: str) -> None:
         read_cloud(tmp_path / name).points()
     assert str(raised.value).isprintable() and name in str(raised.value)
     assert time.monotonic() - began < 10.0  # not for ever; the machine may be busy
+
+
+@pytest.mark.parametrize(("line", "words"), [("WIDTH", "1+1"), ("SIZE", "4 4 x"), ("POINTS", "")])
+def test_a_pcd_header_names_the_line_that_is_wrong(tmp_path: Path, line: str, words: str) -> None:
+    path = tmp_path / "a.pcd"
+    content = pcd("ascii", 2, b"1 2 3\n" * 2, **{line: words})
+    path.write_bytes(content if line != "WIDTH" else content.replace(b"POINTS 2\n", b""))
+    with pytest.raises(
+        DataError, match=rf"found {line} {re.escape(words)}, expected whole numbers in this line"
+    ):
+        read_cloud(path)
 
 
 @pytest.mark.parametrize("header", HEADERS)

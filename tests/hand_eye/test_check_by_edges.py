@@ -122,7 +122,7 @@ def test_the_page_says_that_it_is_a_check() -> None:
         "Verdict",
         "What is weak, and what to record next",
         "Before and after",
-        "Telling objects",
+        "Close-ups of objects",
         "Residuals",
         "Numbers and background",
     ]

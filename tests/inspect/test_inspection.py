@@ -196,6 +196,15 @@ def test_the_text_without_frames_says_so() -> None:
     assert "reason       it moved on" in text and "b/00: -20.00 ms, sigma 2.0 ms" in text
 
 
+def test_nothing_is_predicted_from_an_estimate_that_is_not_to_be_trusted() -> None:
+    trusted = result_of(np.diag(SIGMAS**2), FRAMES)
+    inspection = inspect_result(replace(trusted, status="not_converged", reasons=("it moved on",)))
+    text = inspection_text(inspection)
+    assert inspection.plan is None and to_dict(inspection)["plan"] is None
+    assert "what to record next: not predicted" in text and "more frame" not in text
+    assert text.count("matters most for") == 7
+
+
 def test_the_text_of_a_result_that_used_no_frame() -> None:
     """Sigmas of priors alone, no weak direction named: neither within the limits, nor another method's."""
     result = replace(result_of(100.0 * np.diag(SIGMAS**2)), frames_used=(), status="unobservable")

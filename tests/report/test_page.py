@@ -120,7 +120,7 @@ def test_the_page_is_whole_and_in_order(by: str) -> None:
         "Verdict",
         "What is weak, and what to record next",
         "Before and after",
-        "Telling objects",
+        "Close-ups of objects",
         "Residuals",
         "Likelihood",
         "Numbers and background",
@@ -437,7 +437,7 @@ def test_a_wrong_calibration_is_seen_on_the_page() -> None:
     """0.3 deg of yaw: the top of its curve is where it is taken back."""
     fit = fit_at(np.array([0.0, 0.0, np.radians(0.3), 0.0, 0.0, 0.0, 0.0]))
     page = report_html(ReportInputs(replace(result_by_edges(), fit=fit), [street_by_edges()]))
-    assert _checked(page).headings[3:6] == ["Telling objects", "Residuals", "Likelihood"]
+    assert _checked(page).headings[3:6] == ["Close-ups of objects", "Residuals", "Likelihood"]
 
     def tops(page: str) -> list[float]:
         charts = re.findall(r'aria-label="Likelihood along.*?</figure>', page, re.DOTALL)

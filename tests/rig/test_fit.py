@@ -120,7 +120,7 @@ def test_the_page_of_a_camera_has_its_objects_and_residuals() -> None:
         "Verdict",
         "What is weak, and what to record next",
         "Before and after",
-        "Telling objects",
+        "Close-ups of objects",
         "Residuals",
         "Numbers and background",
     ]

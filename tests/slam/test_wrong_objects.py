@@ -14,6 +14,7 @@ from wrong_objects import POSE, WRONG
 import sst_graph
 from sst_graph import AlignmentKeys, AlignmentTerm, CalibrationMarginal, CameraCalibration, ScanMotion
 from sst_graph.errors import SstGraphError
+from sst_graph.slam.align import VEHICLES
 from sst_graph.slam.config import RematchConfig
 
 FITS: dict[str, set[str]] = {
@@ -108,7 +109,7 @@ def right() -> dict[str, tuple[Callable[..., Any], dict[str, Any]]]:
             sst_graph.align_frame,
             {"scan": scan, "image": image, "calibration": calibration, "motion": motion},
         ),
-        "follow_objects": (sst_graph.follow_objects, {"scans": [scan], "wTls": [POSE]}),
+        "follow_objects": (sst_graph.follow_objects, {"scans": [scan], "wTls": [POSE], "classes": VEHICLES}),
         "KnownPose": (sst_graph.KnownPose, {**named, **sigmas}),
         "KnownRig": (sst_graph.KnownRig, {"poses": (), "one_trigger": True}),
         "marginal.factor": (marginal.factor, {"E_key": E, "D_key": D}),

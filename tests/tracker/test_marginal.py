@@ -83,6 +83,20 @@ def test_in_a_graph_of_one_s_own(marginals: tuple[TrackedMarginal, list[TrackedM
     assert variance == pytest.approx(sigmas[6] ** 2, rel=1e-3)
 
 
+def test_without_further_frames_a_part_adds_nothing(
+    marginals: tuple[TrackedMarginal, list[TrackedMarginal], Tracker],
+) -> None:
+    first, parts, tracker = marginals
+    known = first
+    for part in parts:
+        known = known.plus(part)  # type: ignore[assignment]
+    nothing = tracker.marginal(since=known)
+    scale = np.sqrt(np.outer(np.diag(known.information), np.diag(known.information)))
+    assert np.abs(nothing.information / scale).max() < 1e-6
+    whole = tracker.marginal()
+    assert np.abs(tracker.marginal(since=whole).information / scale).max() < 1e-6
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_a_part_is_exact_however_far_the_estimate_has_moved(seed: int) -> None:
     """Fused with what was known it is the whole, though extrinsics differ by degrees and decimetres."""

@@ -42,6 +42,12 @@ _TURNS_DEG = np.array(
 )
 """(n, 3) turns about the camera's axes from which an estimate is solved again: false optima lie close by in
 roll, in yaw with a shift to the side, and in pitch with a shift in height [deg]."""
+_APART_RAD = np.radians(1.0)
+"""How far false optima lie apart in rotation: what motion knows less well says nothing about them [rad]."""
+_SHORT_TURN_RAD = np.radians(0.2)
+"""A turn shorter than this stays within one optimum [rad]."""
+_KNOWN_TRANSLATION_M = 0.12
+"""Where the translation is known as well as this, the edges lead to it [m]: as from a guess."""
 RESTARTS = 4
 """Most times that a better optimum is followed."""
 _BETTER = 1.005
@@ -117,6 +123,7 @@ def _better_nearby(problem: EdgesProblem, state: State) -> Stepwise[State | None
     t = state.cTl.translation()
     rotations = turned(state.cTl, np.radians(_TURNS_DEG))
     starts = [state, *(replace(state, cTl=gtsam.Pose3(gtsam.Rot3.ClosestTo(R), t)) for R in rotations)]
+    starts += [*toward_motion(problem, state), *shifted(problem, state)]
     found = []
     for start in starts:
         try:
@@ -127,6 +134,44 @@ def _better_nearby(problem: EdgesProblem, state: State) -> Stepwise[State | None
     (_, own), *others = found
     other, found_score = max(others, key=lambda one: one[1], default=(state, 0.0))
     return other if found_score >= _BETTER * own else None
+
+
+def toward_motion(problem: EdgesProblem, state: State) -> list[State]:
+    """The state turned towards the rotation that motion knows, about the middle of what is seen, which stays
+    where it is in the pictures; none where that is no long turn.
+
+    A false optimum in pitch has another height with it, so that a turn about the camera leads out of the
+    picture's edges and back.
+    """
+    known = problem.known
+    prior = _APART_RAD**2 * np.eye(3)
+    turn = difference(state, known.state)[:3]
+    turn = prior @ np.linalg.solve(prior + known.covariance[:3, :3], turn)
+    if np.linalg.norm(turn) < _SHORT_TURN_RAD:
+        return []
+    depths = np.concatenate(
+        [edges.points.lPs @ state.cTl.rotation().matrix()[2] for edges in problem.subset_edges]
+    )
+    depths = depths[depths > 0.0]
+    if len(depths) == 0:
+        return []
+    middle = state.cTl.transformTo(np.array([0.0, 0.0, np.median(depths)]))
+    about = gtsam.Pose3(gtsam.Rot3(), middle)
+    moved = gtsam.Pose3(gtsam.Rot3.Expmap(turn), np.zeros(3))
+    return [replace(state, cTl=state.cTl * about * moved * about.inverse())]
+
+
+def shifted(problem: EdgesProblem, state: State) -> list[State]:
+    """The state with its translation moved by a standard deviation of what is known of it, either way along
+    each axis of the LiDAR; none where a guess says where the camera is."""
+    sigmas_m = np.sqrt(np.diag(problem.known.covariance))[3:6]
+    steps = [
+        sign * sigma_m * axis
+        for sigma_m, axis in zip(sigmas_m, np.eye(3), strict=True)
+        for sign in (-1.0, 1.0)
+        if sigma_m > _KNOWN_TRANSLATION_M
+    ]
+    return [replace(state, cTl=state.cTl * gtsam.Pose3(gtsam.Rot3(), step)) for step in steps]
 
 
 def _newton_ascent(

@@ -35,7 +35,7 @@ def add_source_options(command: argparse.ArgumentParser, several_cameras: bool =
     source = command.add_argument_group("data")
     source.add_argument(
         "--loader",
-        help="format: auto (default), kitti, kitti-raw, folder, nuscenes, ros, or an installed one",
+        help="format: auto (default), kitti, kitti-raw, folder, nuscenes, ros, or an installed loader",
     )
     source.add_argument("--sequence", metavar="NN", help="sequence of a dataset folder, such as 00")
     source.add_argument("--frames", metavar="A:B", help="frames A to B-1 only")
@@ -118,7 +118,7 @@ def add_label_options(command: argparse.ArgumentParser) -> None:
     networks.add_argument(
         "--labels",
         metavar="DIR",
-        help="folder of labels that segment wrote; labels that networks make now are kept there, too",
+        help="folder of labels that segment wrote; with networks, new labels are kept there, too",
     )
 
 

@@ -40,7 +40,7 @@ def add_estimate(command: Parser) -> None:
     command.add_argument(
         "--estimate",
         metavar="NAMES",
-        help="estimate what is otherwise assumed, with the calibration: some of focal, cx, cy, k1, "
+        help="estimate assumptions together with the calibration: some of focal, cx, cy, k1, "
         "k2, sweep, skew, line_delay, range_bias, range_scale, elevation, separated by commas; k1=0.05 gives "
         "the standard deviation of its prior about 0 (docs/understand/assumptions.md)",
     )

@@ -79,6 +79,6 @@ def build_parser() -> argparse.ArgumentParser:
             "-q",
             "--quiet",
             action="store_true",
-            help="no progress, and no summary of what stands in the files; warnings and errors only",
+            help="no progress, and no summary of what is in the files; warnings and errors only",
         )
     return parser

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +68,17 @@ def read_pcd(data: bytes, path: Path) -> Cloud:
     return cloud_of(path, structured_fields(records))
 
 
+def _whole_numbers(name: str, words: list[str], path: Path) -> list[int]:
+    """One or more, of a line of the header."""
+    try:
+        found = [int(word) for word in words]
+    except ValueError:
+        found = []
+    if not found:
+        raise DataError(path, f"{name} {' '.join(words):.40}", "whole numbers in this line of the header")
+    return found
+
+
 def _header(data: bytes, path: Path) -> PcdHeader:
     entries: dict[str, list[str]] = {}
     at = 0
@@ -80,14 +92,12 @@ def _header(data: bytes, path: Path) -> PcdHeader:
             entries[words[0].upper()] = words[1:]
     try:
         names = entries["FIELDS"]
-        sizes, kinds = [int(word) for word in entries["SIZE"]], entries["TYPE"]
-        counts = [int(word) for word in entries.get("COUNT", ["1"] * len(names))]
-        if "POINTS" in entries:
-            count = int(entries["POINTS"][0])
-        else:
-            count = int(entries["WIDTH"][0]) * int(entries["HEIGHT"][0])
-        (kind,) = entries["DATA"]
-    except (KeyError, ValueError, IndexError) as error:
+        sizes, kinds = _whole_numbers("SIZE", entries["SIZE"], path), entries["TYPE"]
+        counts = _whole_numbers("COUNT", entries.get("COUNT", ["1"] * len(names)), path)
+        totals = ("POINTS",) if "POINTS" in entries else ("WIDTH", "HEIGHT")
+        count = prod(_whole_numbers(name, entries[name], path)[0] for name in totals)
+        kind = " ".join(entries["DATA"])
+    except KeyError as error:
         raise DataError(path, f"a header without {error}"[:80], "a PCD header of version 0.7") from None
     if kind not in ("ascii", "binary", "binary_compressed"):
         raise DataError(path, f"DATA {kind:.40}", "ascii, binary or binary_compressed")

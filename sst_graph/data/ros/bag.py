@@ -275,5 +275,12 @@ def _close(reader: Any) -> None:
 
 
 def _unreadable(path: Path, error: Exception) -> DataError:
-    """What rosbags and the decoders below it raise on damaged bytes has no common root."""
-    return DataError(path, f"a bag that cannot be read ({one_line(error)})", WHOLE_BAG)
+    """What rosbags and the decoders below it raise on damaged bytes has no common root.
+
+    What Python says of a missing entry or one of another type would mean nothing to a reader of the message.
+    """
+    python_says = isinstance(
+        error.__cause__ or error, (LookupError, TypeError, AttributeError, AssertionError)
+    )
+    why = "entries of it are missing or of another type" if python_says else one_line(error)
+    return DataError(path, f"a bag that cannot be read ({why})", WHOLE_BAG)

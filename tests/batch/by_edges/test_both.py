@@ -334,8 +334,8 @@ def test_the_page_has_a_section_of_each() -> None:
     headings = re.findall(r"<h2>([^<]*)</h2>", page)
     assert headings[2:-1] == [
         "Before and after",
-        "Telling objects: labels",
-        "Telling objects: edges, in frames without labels",
+        "Close-ups of objects: labels",
+        "Close-ups of objects: edges, in frames without labels",
         "Residuals: labels",
         "Residuals: edges, in frames without labels",
     ]

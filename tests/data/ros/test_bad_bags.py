@@ -289,6 +289,16 @@ def test_a_folder_whose_recording_was_ended_before_its_metadata(
     assert "found 2 bags (drive" in found and "'ros2 bag reindex' writes it" in found
 
 
+@pytest.mark.parametrize("text", ["", "rosbag2_bagfile_information:\n", "rosbag2_bagfile_information: 3\n"])
+def test_a_folder_whose_metadata_lacks_entries(
+    text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = made(tmp_path, fill)
+    (path / "metadata.yaml").write_text(text)
+    line = refused(capsys, path)
+    assert "cannot be read" in line and "NoneType" not in line and "Error" not in line
+
+
 def test_an_mcap_file_of_other_messages_than_those_of_ros_2(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
