@@ -208,9 +208,8 @@ class LinearProblem:
         covariance = covariance_of(bread, table, fit_error_model(table.residuals))
         column = self.unknowns.column(nuisance_key(name))
         place = int(np.searchsorted(kept, column))
-        by_image = shifts_of(table, bread[place : place + 1], *self.by_image).covariance[0, 0]
-        sigma = float(np.sqrt(covariance[place, place] + by_image))
-        sigma *= few_objects_factor(int(table.objects.max()) + 1, config.threshold)
+        variance = float(covariance[place, place])
+        sigma = _deviation(variance, bread[place], table, self.by_image, config.threshold)
         value = self.values[name] + float(step[column])
         return ParameterTest.of(ASSUMPTIONS[name], value, sigma, config.threshold)
 
@@ -269,11 +268,28 @@ def _solved_alone(
     )
     column = robust.unknowns.column(nuisance_key(name))
     by_image = columns_by_image(robust.table, solution.pairs, solution.values, solution.state)
-    shifts = shifts_of(robust.table, robust.bread[column : column + 1], *by_image)
-    value = solution.state.nuisances[name]
-    sigma = float(np.sqrt(robust.matrix[column, column] + shifts.covariance[0, 0]))
-    sigma *= few_objects_factor(int(robust.table.objects.max()) + 1, config.threshold)
+    value, variance = solution.state.nuisances[name], float(robust.matrix[column, column])
+    sigma = _deviation(variance, robust.bread[column], robust.table, by_image, config.threshold)
     return ParameterTest.of(finding.assumption, value, sigma, config.threshold)
+
+
+def _deviation(
+    variance: float,
+    bread: FloatArray,
+    table: MatchTable,
+    by_image: tuple[FloatArray, IntArray],
+    threshold: float,
+) -> float:
+    """Of a parameter: by the matches, by what shifts from image to image, and for few objects.
+
+    Args:
+        variance: by the matches.
+        bread: (n,) the parameter's row of the inverse of the information.
+        by_image: of :func:`~sst_graph.covariance.image_shifts.columns_by_image`.
+    """
+    by_shifts = shifts_of(table, bread[None], *by_image).covariance[0, 0]
+    objects = int(table.objects.max()) + 1
+    return float(np.sqrt(variance + by_shifts)) * few_objects_factor(objects, threshold)
 
 
 def with_further_tests(

@@ -178,19 +178,10 @@ def _variances(fits: Sequence[_Fit]) -> FloatArray:
     The scatter of one image's few sides tells little: images share the ratio by which it is larger than that
     of independent matches.
     """
+    every = np.array([(fit.shift, fit.independent, fit.by_sides) for fit in fits]).reshape(-1, 3, 3)
     found = np.zeros(3)
-    for k in range(3):
-        shift, independent, by_sides = (
-            np.array(
-                [
-                    (fit.shift[k], fit.independent[k], fit.by_sides[k])
-                    for fit in fits
-                    if np.isfinite(fit.shift[k])
-                ]
-            )
-            .reshape(-1, 3)
-            .T
-        )
+    for k, of_kind in enumerate(every.transpose(2, 0, 1)):
+        shift, independent, by_sides = of_kind[np.isfinite(of_kind[:, 0])].T
         if len(shift) > 1:
             own = independent * (by_sides.sum() / independent.sum())
             found[k] = spread_beyond(shift / _UNITS[k], own / _UNITS[k] ** 2, np.zeros(len(own), np.intp))

@@ -149,9 +149,8 @@ def toward_motion(problem: EdgesProblem, state: State) -> list[State]:
     turn = prior @ np.linalg.solve(prior + known.covariance[:3, :3], turn)
     if np.linalg.norm(turn) < _SHORT_TURN_RAD:
         return []
-    depths = np.concatenate(
-        [edges.points.lPs @ state.cTl.rotation().matrix()[2] for edges in problem.subset_edges]
-    )
+    lPs = np.concatenate([edges.points.lPs for edges in problem.subset_edges])
+    depths = state.cTl.transformFrom(lPs.T)[2]
     depths = depths[depths > 0.0]
     if len(depths) == 0:
         return []
