@@ -152,8 +152,11 @@ def main() -> None:
     parser.add_argument("--method", default="joint", help="of --subtle: joint or edges")
     parser.add_argument("--faults", nargs="*", default=[])
     args = parser.parse_args()
+    known = (CLEAN, *SUBTLE_FAULTS) if args.subtle else (CLEAN, *INPUT_FAULTS, RIGHT)
+    if unknown := set(args.faults) - set(known):
+        parser.error(f"--faults: found {', '.join(sorted(unknown))}, expected some of {', '.join(known)}")
     if not args.subtle and not args.faults:
-        args.faults = [CLEAN, *INPUT_FAULTS, RIGHT]
+        args.faults = list(known)
     right: list[bool] = []
     head, found = (SUBTLE_HEAD, subtle_rows) if args.subtle else (HEAD, rows)
     for line in lines(head, found(args, right)):
