@@ -20,6 +20,8 @@ from sst_graph.diagnosis.fit import (
     LEAST_EXPLAINED_GAIN,
     LEAST_GAIN,
     LEAST_QUALITY,
+    THERE_DEG,
+    THERE_GAIN,
     WELL,
     Fit,
     Fitter,
@@ -27,6 +29,7 @@ from sst_graph.diagnosis.fit import (
 from sst_graph.diagnosis.poses import start_finding
 from sst_graph.drive.preparation import Drive, ScanFeatures
 from sst_graph.errors import count_of
+from sst_graph.metrics import quaternion_angle_deg
 from sst_graph.types import FloatArray, Guess
 
 
@@ -70,18 +73,22 @@ def best_hypothesis(drive: Drive, guess: Guess, fit: Fitter, given: Fit | None) 
 def _best(
     tried: Iterator[Hypothesis], guess: Guess, fit: Fitter, given: Fit | None, enough: float = np.inf
 ) -> tuple[float, Finding] | None:
-    """Quality and cause of the best change that is accepted; none is tried after one of ``enough``."""
+    """Quality, higher where the labels agree just there, and cause of the best change that is accepted; none
+    is tried after one of ``enough``."""
     base = Fit(gtsam.Pose3(), 0.0, 0.0, 0.0) if given is None else given
     best: tuple[float, Finding] | None = None
     for hypothesis in tried:
         found = fit(hypothesis.drive, hypothesis.guess)
-        if found is None or found.concentration < LEAST_CONCENTRATION:
+        if found is None:
             continue
-        if found.quality < max(LEAST_QUALITY, LEAST_GAIN * base.quality):
+        quality = _quality(found, hypothesis.guess)
+        if quality == found.quality and found.concentration < LEAST_CONCENTRATION:
+            continue
+        if quality < max(LEAST_QUALITY, LEAST_GAIN * _quality(base, guess)):
             continue
         if found.explained < LEAST_EXPLAINED_GAIN * base.explained:
             continue
-        if best is None or found.quality > best[0]:
+        if best is None or quality > best[0]:
             before = 100.0 * base.explained
             evidence = (
                 f"undone, {100.0 * found.explained:.0f} % of the outlines meet; as given, {before:.0f} %"
@@ -91,10 +98,18 @@ def _best(
                 finding = replace(finding, evidence=f"{evidence}, time offset {found.time_offset_s:+.2f} s")
             if hypothesis.start is not None:
                 finding = start_finding(hypothesis.start, found, finding)
-            best = found.quality, finding
-        if found.quality > enough:
+            best = quality, finding
+        if quality > enough:
             break
     return best
+
+
+def _quality(found: Fit, guess: Guess) -> float:
+    """Quality of a fit, higher where the labels agree just at its guess."""
+    if guess.cTl is None:
+        return found.quality
+    far_deg = quaternion_angle_deg(guess.cTl.rotation(), found.cTl.rotation())
+    return THERE_GAIN * found.quality if far_deg < THERE_DEG else found.quality
 
 
 def _shifts(drive: Drive, guess: Guess) -> Iterator[Hypothesis]:

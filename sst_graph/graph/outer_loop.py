@@ -309,11 +309,15 @@ def concentration(solution: JointSolution, problem: JointProblem) -> float:
     The residuals of a true pose are the masks' errors, so most are below the last scale; those of a wrong
     pose that was fitted to some contours are spread over all distances.
     """
-    kernel = RobustKernel("geman_mcclure", CONCENTRATION_SCALES[1] * KERNELS_PX[-1])
-    matches = match_all(
-        edges_of(problem.drives, problem.motions, problem.config.graph), solution.state, kernel
+    edges = edges_of(problem.drives, problem.motions, problem.config.graph)
+    close, all_ = (
+        _support(
+            match_all(edges, solution.state, RobustKernel("geman_mcclure", scale * KERNELS_PX[-1])),
+            solution.state,
+        )
+        for scale in CONCENTRATION_SCALES
     )
-    return support(solution) / max(_support(matches, solution.state), 1e-9)
+    return close / max(all_, 1e-9)
 
 
 def explained(solution: JointSolution) -> float:

@@ -70,7 +70,7 @@ def registration_cloud(
     Args:
         points: (n, 3) [m].
         voxel_m: edge of the voxels of which one mean point is kept [m].
-        neighbours: points from which a covariance is estimated.
+        neighbours: fewest points from which a covariance is estimated.
         plane_ratio: most points of the main direction, per point of another direction.
     """
     # From a cloud: from an array small_gicp takes half as long again.
@@ -108,11 +108,42 @@ _COARSER = 2.0
 def surfaces(points: FloatArray, neighbours: int) -> small_gicp.PointCloud:
     """Points (n, 3) or homogeneous (n, 4) [m] with the covariance of the surface around each.
 
+    Args:
+        neighbours: fewest from which it is estimated.
+
     Raises:
         DataError: another shape, or NaN or inf, on which small_gicp ends the process.
     """
     if points.ndim != 2 or points.shape[1] not in (3, 4) or not np.isfinite(points).all():
         raise DataError("points to register", f"an array {points.shape} or NaN", "(n, 3) or (n, 4), finite")
     cloud = small_gicp.PointCloud(points)
-    small_gicp.estimate_normals_covariances(cloud, num_neighbors=neighbours, num_threads=1)
+    tree = small_gicp.KdTree(cloud)
+    number = _neighbours(np.asarray(cloud.points())[:, :3], tree, neighbours)
+    small_gicp.estimate_normals_covariances(cloud, tree, num_neighbors=number, num_threads=1)
     return cloud
+
+
+def _neighbours(points: FloatArray, tree: small_gicp.KdTree, fewest: int) -> int:
+    """How many neighbours of points (n, 3) span a surface.
+
+    Where scan lines are far apart, the nearest points all lie on one of them and tell no normal: registration
+    then holds rings to rings, and comes out short of the motion.
+    """
+    if len(points) < _MORE_NEIGHBOURS:
+        return fewest
+    sample = points[:: max(1, len(points) // _SAMPLE)]
+    near = points[np.asarray(tree.batch_knn_search(sample, fewest)[0], np.intp)]
+    near -= near.mean(axis=1, keepdims=True)
+    variances = np.linalg.eigvalsh(near.transpose(0, 2, 1) @ near)
+    lines = np.mean(variances[:, 1] < _LINE_RATIO * variances[:, 2])
+    return max(fewest, _MORE_NEIGHBOURS) if lines > _MOST_LINES else fewest
+
+
+_SAMPLE = 200
+"""Points whose neighbours are looked at."""
+_MORE_NEIGHBOURS = 20
+"""Where the fewest lie on lines: 32 rings 1.3 deg apart came out 0.7 m short in a motion of 0.76 m."""
+_LINE_RATIO, _MOST_LINES = 0.05, 0.25
+"""Neighbours lie on a line where their second variance is less than this ratio of their first; at most this
+share of the neighbourhoods may. Of six neighbours each, 4 to 11 % do with 64 and 128 rings, 27 to 32 % with
+32 rings 1.3 deg apart. More neighbours for all would make the motions of 64 rings 1.5 times worse."""

@@ -53,15 +53,13 @@ _MAX_DISTANCE_M = 1.0
 """Farthest pair of a point and a voxel [m]."""
 _MAX_ITERATIONS = 30
 """Most Gauss-Newton steps of a registration; it stops where a step is below 1e-4 rad and 5e-4 m."""
-_SEARCH_M, _SEARCH_STEP_M = 3.0, 0.6
-"""Where the speed is unknown (first pair, or after a failure), starts shifted up to this far in the LiDAR's
-horizontal plane, and this far apart, are tried [m]: 30 m/s at 10 Hz."""
-_SEARCH_ITERATIONS = 6
-"""Gauss-Newton steps from each such start."""
-_STANDSTILL_M, _STANDSTILL_INLIER_RATIO = 0.02, 0.65
-"""No farther shift is tried where the best of the nearest ones stays within this distance of the prediction
-with at least this fraction of its points paired: standstill [m, 1]. Along a street's walls a scan may well
-stay where it was started, which neighbouring starts show."""
+_SEARCH_M = 3.0
+"""Where the speed is unknown (first pair, or after a failure), starts shifted this far in the LiDAR's
+horizontal plane, in eight directions, are tried, too [m]: 30 m/s at 10 Hz."""
+_SEARCH_DISTANCE_M, _SEARCH_ITERATIONS = 2.0, 10
+"""Farthest pair of two points in this search [m], and Gauss-Newton steps from each start."""
+_SEARCH_VOXELS = 4.0
+"""Edge of the voxels of which one point is registered in this search, in edges of the usual ones."""
 _MISSED_COST = 1.0
 """What a point without a voxel to pair with costs in the choice among starts; a pair costs its squared,
 whitened residual."""
@@ -181,30 +179,39 @@ class LidarOdometry:
     def _best_start(self, points: FloatArray, wTl: FloatArray) -> FloatArray:
         """The pose from which registration goes best, among shifts of the predicted one all around it.
 
-        With nothing known of the speed, registration alone ends in the nearest of many local minima.
+        With nothing known of the speed, registration to the map ends in the nearest of many local minima, and
+        where rings are far apart in that of no motion: what lies between the map's rings has no voxel. So the
+        cloud is registered to the points of the last one.
         """
-        if self._map is None or len(points) < _MIN_POINTS:
+        if not self._mapped or len(points) < _MIN_POINTS:
             return wTl
-        cloud = registration_cloud(points, 2.0 * self._voxel_m, _NEIGHBOURS, PLANE_RATIO)
-        best, least, paired = wTl, np.inf, 0.0
-        for number, shift in enumerate(_shifts(_SEARCH_M, _SEARCH_STEP_M)):
-            start = wTl.copy()
-            start[:3, 3] += wTl[:3, :3] @ shift
-            result = self._registered(cloud, start, _SEARCH_ITERATIONS)
-            if result is None:
-                return wTl
+        cloud = registration_cloud(points, _SEARCH_VOXELS * self._voxel_m, _NEIGHBOURS, PLANE_RATIO)
+        _, last, wTlast = self._mapped[-1]
+        if min(last.size(), cloud.size()) < FEWEST_POINTS:
+            return wTl
+        tree = small_gicp.KdTree(last)
+        best, least = wTl, np.inf
+        for shift in _shifts():
+            start = np.linalg.inv(wTlast) @ wTl
+            start[:3, 3] += start[:3, :3] @ shift
+            result = small_gicp.align(
+                last,
+                cloud,
+                tree,
+                start,
+                max_correspondence_distance=_SEARCH_DISTANCE_M,
+                num_threads=1,
+                max_iterations=_SEARCH_ITERATIONS,
+            )
             found = np.asarray(result.T_target_source)
             missed = cloud.size() - result.num_inliers
             misfit = (2.0 * result.error + _MISSED_COST * missed) / cloud.size()
             if np.isfinite(found).all() and misfit < least:
-                best, least, paired = orthonormal(found), misfit, result.num_inliers / cloud.size()
-            stands = float(np.linalg.norm(best[:3, 3] - wTl[:3, 3])) < _STANDSTILL_M
-            if number == _AROUND and stands and paired >= _STANDSTILL_INLIER_RATIO:
-                return best
+                best, least = wTlast @ orthonormal(found), misfit
         return best
 
     def _registered(
-        self, cloud: small_gicp.PointCloud, wTl: FloatArray, iterations: int
+        self, cloud: small_gicp.PointCloud, wTl: FloatArray
     ) -> small_gicp.RegistrationResult | None:
         """A cloud registered to the map from a start; None where either has too few points."""
         assert self._map is not None
@@ -217,7 +224,7 @@ class LidarOdometry:
             wTl,
             max_correspondence_distance=_MAX_DISTANCE_M,
             num_threads=1,
-            max_iterations=iterations,
+            max_iterations=_MAX_ITERATIONS,
             rotation_epsilon=1e-4,
             translation_epsilon=5e-4,
         )
@@ -227,7 +234,7 @@ class LidarOdometry:
         if self._map is None or len(points) < _MIN_POINTS:
             return None
         cloud = registration_cloud(points, self._voxel_m, _NEIGHBOURS, PLANE_RATIO)
-        result = self._registered(cloud, wTl, _MAX_ITERATIONS)
+        result = self._registered(cloud, wTl)
         if result is None:
             return None
         found = np.asarray(result.T_target_source)
@@ -363,17 +370,11 @@ def registration_covariance(result: small_gicp.RegistrationResult) -> FloatArray
     return np.asarray(_INFLATION**2 * variance * np.linalg.inv(hessian))
 
 
-_AROUND = 8
-"""Shifts on a ring."""
-
-
-def _shifts(far: float, step: float) -> list[FloatArray]:
-    """Horizontal translations (3,) [m]: none first, then on rings ``step`` apart up to ``far``."""
-    shifts = [np.zeros(3)]
-    for radius in np.arange(step, far + 1e-9, step):
-        for angle in np.arange(_AROUND) * (2.0 * np.pi / _AROUND):
-            shifts.append(radius * np.array([np.cos(angle), np.sin(angle), 0.0]))
-    return shifts
+def _shifts() -> list[FloatArray]:
+    """Horizontal translations (3,) [m]: none first, then all around."""
+    angles = np.arange(8) * (2.0 * np.pi / 8)
+    around = _SEARCH_M * np.stack([np.cos(angles), np.sin(angles), np.zeros(8)], axis=1)
+    return [np.zeros(3), *around]
 
 
 def _exp(twist: FloatArray | None, seconds: float) -> FloatArray:

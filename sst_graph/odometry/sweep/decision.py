@@ -61,9 +61,9 @@ _PART, _PART_SIGMAS = 0.12, 6.0
 """Farther than this from 0, -1 and 1, beside so many of its sigmas, the share is that of points which were
 moved by a part of the motion, or by the wrong one. Of 15 whole sweeps on simulated streets it came out up to
 0.25 and up to 5.6 sigmas from the nearest of these, but not both beyond."""
-_LONG_SWEEP_M = 1.0
-"""Where the vehicle moves farther in a turn, a wrong hypothesis keeps the matches made under it, and all
-hypotheses are tried as starts [m]."""
+_LONG_SWEEP_M, _REACH_M = 1.0, 10.0
+"""Where surfaces at this distance [m] move farther than this in a turn of the scanner [m], a wrong hypothesis
+keeps the matches made under it, and all hypotheses are tried as starts."""
 _MIN_EXPECTED = 0.5
 """Share of the evidence needed below which no more windows are registered."""
 
@@ -301,7 +301,8 @@ def _decide(windows: Sequence[Window], timing: SweepTiming) -> SweepDecision:
     """The decision from some windows."""
     speed = max(float(np.linalg.norm(window.twists[:, 3:], axis=1).mean()) for window in windows)
     fraction, sector = 0.0, 0
-    if speed * timing.period_s > _LONG_SWEEP_M:
+    turn = max(float(np.linalg.norm(window.twists[:, :3], axis=1).mean()) for window in windows)
+    if (speed + turn * _REACH_M) * timing.period_s > _LONG_SWEEP_M:
         fraction, sector = _best_start(windows[0].thinned(_FEW_SCANS, _FEW_POINTS))
     found = estimate(windows, fraction, sector)
     if not any(window.has_matches for window in windows):
