@@ -42,6 +42,7 @@ from sst_graph.graph.nuisances import deviation_of, moved_twists, residual_colum
 from sst_graph.graph.state import State, lower_edge_track
 from sst_graph.objects.dynamic_objects import dynamic_object_weights
 from sst_graph.objects.tracks import numbers_in, of_each
+from sst_graph.sampling import step_for
 from sst_graph.types import FloatArray, IntArray, SemanticClass
 
 
@@ -214,7 +215,7 @@ class DriveEdges:
 
     def thinned(self, most: int) -> DriveEdges:
         """Evenly spread points, at most so many."""
-        index = np.arange(0, len(self), max(1, -(-len(self) // most)))
+        index = np.arange(0, len(self), step_for(len(self), most))
         return replace(
             self,
             points=self.points.take(index),

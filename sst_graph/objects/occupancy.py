@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from sst_graph.drive.preparation import ScanFeatures
 from sst_graph.odometry.lidar import GROUND_CLASSES, TESTED_CLASSES
+from sst_graph.sampling import step_for
 from sst_graph.types import FloatArray, SemanticClass
 
 ObjectName = tuple[SemanticClass, int]
@@ -210,4 +211,4 @@ def _some_of_each(objects: NDArray[np.intp], most: int) -> NDArray[np.intp]:
     """Positions of at most ``most`` evenly spread entries of each number."""
     order = np.argsort(objects, kind="stable")
     parts = np.split(order, np.flatnonzero(np.diff(objects[order])) + 1)
-    return np.concatenate([part[:: -(-len(part) // most)] for part in parts if len(part)])
+    return np.concatenate([part[:: step_for(len(part), most)] for part in parts if len(part)])

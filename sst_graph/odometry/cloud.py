@@ -7,6 +7,7 @@ import small_gicp
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
+from sst_graph.sampling import spread_places
 from sst_graph.types import FloatArray, Scan
 
 PARALLEL_COSINE = 0.9
@@ -52,8 +53,7 @@ def usable_points(
     """
     square = np.einsum("ij,ij->i", scan.points, scan.points)
     kept = np.flatnonzero((square > near_m**2) & (square < far_m**2))  # NaN and inf compare as False
-    if len(kept) > most:
-        kept = kept[np.linspace(0, len(kept) - 1, most).astype(np.intp)]
+    kept = spread_places(kept, most)
     offsets = None if scan.offsets_s is None else scan.offsets_s[kept].astype(np.float64)
     return scan.points.take(kept, axis=0).astype(np.float64), scan.classes[kept], offsets
 
@@ -81,7 +81,7 @@ def registration_cloud(
     allowed = max(int(plane_ratio * (len(lPs) - len(members))), 10 * neighbours)
     if len(members) > allowed:
         kept = ~parallel
-        kept[members[np.linspace(0, len(members) - 1, allowed).astype(np.intp)]] = True
+        kept[spread_places(members, allowed)] = True
         lPs = lPs[kept]
     return surfaces(lPs, neighbours)
 

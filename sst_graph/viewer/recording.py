@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from sst_graph.errors import ConfigError, optional_module
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.inspect.inspection import HUMAN
+from sst_graph.sampling import step_for
 from sst_graph.tracker.track_update import TrackUpdate
 from sst_graph.types import Calibration, FloatArray, SemanticClass
 from sst_graph.viewer.frame_view import FrameView, MatchView
@@ -115,7 +116,7 @@ class Recording:
         self._at(view.number, scan.stamp_ns)
         self._log(LIDAR, _transform(rr, view.oTl))
         self._log(CAMERA, _transform(rr, view.cTl.inverse()))
-        every = max(1, -(-len(scan.points) // _MOST_POINTS))
+        every = step_for(len(scan.points), _MOST_POINTS)
         self._log(f"{LIDAR}/cloud", rr.Points3D(scan.points[::every], class_ids=scan.classes[::every]))
         self._path.append(np.asarray(view.oTl.translation()))
         self._log("world/trajectory", rr.LineStrips3D([np.array(self._path)], colors=[(255, 200, 0)]))

@@ -25,6 +25,7 @@ from sst_graph.factors.motion import cross
 from sst_graph.odometry.cloud import compensate_sweep, usable_points
 from sst_graph.odometry.lidar import GROUND_CLASSES, TESTED_CLASSES, LidarOdometry, orthonormal
 from sst_graph.odometry.static_points import on_static_objects
+from sst_graph.sampling import spread_places
 from sst_graph.sweep_timing import turned
 from sst_graph.types import FloatArray, Scan
 
@@ -417,19 +418,14 @@ def _of_every_direction(normals: FloatArray, most: int) -> IndexArray:
     number = np.mod(np.arctan2(normals[:, 1], normals[:, 0]), np.pi) / np.pi * _DIRECTIONS
     upright = np.minimum(number.astype(np.intp), _DIRECTIONS - 1)
     direction = np.where(np.abs(normals[:, 2]) > _LEVEL, _DIRECTIONS, upright)
-    return np.concatenate([_spread(direction == k, most) for k in range(_DIRECTIONS + 1)])
+    along = [np.flatnonzero(direction == k) for k in range(_DIRECTIONS + 1)]
+    return np.concatenate([spread_places(places, most) for places in along])
 
 
 _LEVEL = 0.8
 """A surface whose normal's height is more than this is level."""
 _DIRECTIONS = 12
 """Directions of normals in the horizontal plane that are distinguished."""
-
-
-def _spread(chosen: NDArray[np.bool_], most: int) -> IndexArray:
-    """At most so many of the places where an array is True, evenly spread."""
-    found = np.flatnonzero(chosen)
-    return found if len(found) <= most else found[np.linspace(0, len(found) - 1, most).astype(np.intp)]
 
 
 def _groups(cells: IndexArray) -> tuple[IndexArray, IndexArray]:
