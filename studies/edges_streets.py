@@ -107,7 +107,7 @@ def rows(
         start = truth.cTl.retract(start_step(name)) if guessed else None
         result = calibrate(source, start, CalibrationConfig(method="edges"))
         seconds = time.process_time() - began
-        error = error_of(result.T_camera_lidar, result.time_offset_s, truth)
+        error = error_of(result.calibration, truth)
         nees = nees_of(error, result.covariance)
         found.append((error * UNITS, nees))
         for reason in result.reasons:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.mask_contour import ContourMap
-from sst_graph.types import CameraImage, FloatArray, Frame, Scan, SemanticClass
+from sst_graph.types import Calibration, CameraImage, FloatArray, Frame, Scan, SemanticClass
 
 Picture = NDArray[np.uint8]
 Colour = tuple[int, int, int]
@@ -46,18 +46,14 @@ TIME_STEP_S = 0.5e-3
 """Points of a rolling sweep are moved in steps of this [s]; at 15 m/s the rest is 4 mm."""
 
 
-@dataclass(frozen=True)
-class Placement:
-    """One way to place the LiDAR in the camera: the pose, the offset, and a caption.
+@dataclass(frozen=True, eq=False)
+class Placement(Calibration):
+    """One way to place the LiDAR in the camera, and a caption.
 
     Attributes:
-        cTl: pose of the LiDAR in the camera.
-        time_offset_s: offset with the sign of :mod:`factors` [s].
         caption: words over the picture, such as "before".
     """
 
-    cTl: gtsam.Pose3
-    time_offset_s: float
     caption: str = ""
 
 

@@ -127,7 +127,7 @@ def test_elimination_in_turn_is_one_graph() -> None:
     for k, found in enumerate(smoothed(drives, steps, config)):
         covariance = marginals.jointMarginalCovariance([EXTRINSIC + k, TIME_OFFSET + k]).fullMatrix()
         time_offset_s = float(best.atVector(TIME_OFFSET + k)[0])
-        assert_same(found, Smoothed(best.atPose3(EXTRINSIC + k), time_offset_s, covariance), 0.01)
+        assert_same(found, Smoothed(best.atPose3(EXTRINSIC + k), time_offset_s, covariance=covariance), 0.01)
 
 
 def test_the_ends_of_a_stretch_have_one_side() -> None:

@@ -20,12 +20,12 @@ from sst_graph import CalibrationConfig, Tracker, TrackerConfig, open_source
 from sst_graph.association.edge_matching import MatchConfig
 from sst_graph.batch.by_edges.problem import POINTS_A_SCAN
 from sst_graph.cli import main
+from sst_graph.experiments.starts import errors_of
 from sst_graph.factors.alignment import weighted_residuals
 from sst_graph.features.picture_gradients import PictureGradients
 from sst_graph.graph.known import KnownCalibration
 from sst_graph.graph.state import State
 from sst_graph.hand_eye.graph import camera_steps
-from sst_graph.metrics import calibration_errors
 from sst_graph.result import CalibrationResult, read_result
 from sst_graph.tracker.by_edges.review import EdgeReview, variance_ratio
 from sst_graph.tracker.estimate import OnlineEstimate
@@ -330,7 +330,7 @@ def test_a_real_drive_without_label_files(
     np.testing.assert_array_equal(last["T_camera_lidar"], result.T_camera_lidar.matrix())
     np.testing.assert_array_equal(last["covariance"], result.covariance)
     assert last["time_offset_s"] == result.time_offset_s and last["status"] in statuses
-    errors = calibration_errors(result.T_camera_lidar, result.time_offset_s, truth, result.covariance)
+    errors = errors_of(result, truth)
     assert errors.qad_deg < 0.25 and errors.atd_m < 0.03
     assert errors.time_offset_s is not None and abs(errors.time_offset_s) < 0.015
     late = result.time_offset_s - truth.time_offset_s
