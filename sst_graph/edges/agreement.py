@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +23,7 @@ from sst_graph.features.picture_gradients import (
 )
 from sst_graph.graph.matching import DriveEdges
 from sst_graph.graph.state import State
+from sst_graph.odometry.cloud import transformed_points
 from sst_graph.types import FloatArray, IntArray
 
 FloatMap = NDArray[np.float32]
@@ -124,7 +124,7 @@ class BlurredScore:
         fields = np.stack([known_fields[id(paired.contours[k])] for k in known])
         to_lidar = cTl.inverse()
         lPs, tips = (
-            _moved(to_lidar, paired.moved(each, cTl, time_offset_s))
+            transformed_points(to_lidar, paired.moved(each, cTl, time_offset_s))
             for each in (paired.points.lPs, paired.points.outward)
         )
         numbers = np.array([names.get(k, -1) for k in range(len(paired.contours))])
@@ -165,7 +165,3 @@ def _gradients(paired: PairedEdges, group: int) -> PictureGradients:
     gradients = paired.contours[group]
     assert isinstance(gradients, PictureGradients)
     return gradients
-
-
-def _moved(pose: gtsam.Pose3, points: FloatArray) -> FloatArray:
-    return np.asarray(points @ pose.rotation().matrix().T + pose.translation())

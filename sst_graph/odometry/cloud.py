@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gtsam
 import numpy as np
 import small_gicp
 from numpy.typing import NDArray
@@ -41,6 +42,11 @@ def _turned(omega: FloatArray, points: FloatArray) -> FloatArray:
 
 FEWEST_POINTS = 11
 """That small_gicp registers without a warning of its own on stderr."""
+
+
+def transformed_points(aTb: gtsam.Pose3, bPs: FloatArray) -> FloatArray:
+    """(n, 3) points of frame b in frame a; ``transformFrom`` flattens a batch of one."""
+    return np.asarray(bPs @ aTb.rotation().matrix().T + aTb.translation())
 
 
 def usable_points(

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.mask_contour import ContourMap
+from sst_graph.odometry.cloud import transformed_points
 from sst_graph.types import Calibration, CameraImage, FloatArray, Frame, Scan, SemanticClass
 
 Picture = NDArray[np.uint8]
@@ -124,7 +125,7 @@ def _projected(
     c_twist: FloatArray | None,
 ) -> tuple[FloatArray, NDArray[np.uint8], FloatArray]:
     """Pixels (m, 2), classes (m,) and depths (m,) [m] of the points on the image, far ones first."""
-    cPs = _transformed(cTl, scan.points.astype(np.float64))
+    cPs = transformed_points(cTl, scan.points.astype(np.float64))
     if c_twist is not None:
         tau = (image.stamp_ns - scan.stamp_ns) * 1e-9 + time_offset_s
         offsets_s = np.zeros(len(cPs)) if scan.offsets_s is None else scan.offsets_s.astype(np.float64)
@@ -143,13 +144,8 @@ def _moved(cPs: FloatArray, taus_s: FloatArray, c_twist: FloatArray) -> FloatArr
     for step in np.unique(steps):
         chosen = steps == step
         motion = gtsam.Pose3.Expmap(-c_twist * float(taus_s[chosen].mean()))
-        moved[chosen] = _transformed(motion, cPs[chosen])
+        moved[chosen] = transformed_points(motion, cPs[chosen])
     return moved
-
-
-def _transformed(aTb: gtsam.Pose3, bPs: FloatArray) -> FloatArray:
-    """(n, 3) points in frame a; ``transformFrom`` itself flattens a batch of one."""
-    return bPs @ aTb.rotation().matrix().T + aTb.translation()
 
 
 def _backdrop(image: CameraImage) -> Picture:
