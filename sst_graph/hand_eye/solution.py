@@ -84,7 +84,7 @@ class MotionSolution:
 
     @property
     def misfit(self) -> str | None:
-        """Why the covariance is not to be believed; None where the odometry fits."""
+        """Why the covariance may be wrong; None where the odometry fits."""
         worst = max(self.scales.rotation, self.scales.direction)
         if worst <= MAX_NOISE_SCALE:
             return None

@@ -199,7 +199,7 @@ class _Outlines:
 
 
 def _tree(wPs: FloatArray) -> cKDTree:
-    """Points (n, 3) to look among: for few queries, so it is built without care for its shape."""
+    """A tree of points (n, 3); for few queries it is not balanced, which takes longer than they do."""
     return cKDTree(wPs, balanced_tree=False, compact_nodes=False)
 
 

@@ -54,7 +54,7 @@ def profiles(
         for sign in (-1.0, 1.0):
             for count in counts:
                 step = sign * count * unit
-                # The answer of the rest by the linear problem, then once more where that leads.
+                # The other unknowns follow by one linear step, then by a second one from there.
                 point = frozen.moved(optimum, *system.step_along(unknown, step))
                 point = frozen.moved(point, *frozen.linearized(point).step_along(unknown, 0.0))
                 steps.append(step)

@@ -63,7 +63,7 @@ def profile_charts(profiles: Sequence[Profile], result: CalibrationResult) -> li
 
 def _profile(profile: Profile, sigma: float) -> str:
     unit, scale = UNITS[profile.unknown], float(HUMAN[profile.unknown])
-    # The cost counts matches as independent; the covariance knows better. Both get the same width.
+    # The cost counts matches as independent, the covariance does not: the cost is scaled to its width.
     tempered = profile.costs * (profile.sigma / sigma) ** 2
     x = np.linspace(profile.steps[0], profile.steps[-1], 81)
     chart = Chart(

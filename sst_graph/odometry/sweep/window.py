@@ -235,7 +235,7 @@ class Window:
             share = turned(surfaces.azimuths, start_rad) - 0.5
             points = compensate_sweep(surfaces.points, fraction * self.period_s * share, twist)
             world = points @ pose[:3, :3].T + pose[:3, 3]
-            # A tree of few queries: built faster than it is balanced.
+            # For few queries: balancing it takes longer than they do.
             posed.append(_PosedScan(points, cKDTree(world, balanced_tree=False, compact_nodes=False), twist))
         count = len(self._poses)
         self._matches = [
