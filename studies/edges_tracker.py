@@ -22,7 +22,6 @@ import numpy as np
 from sst_graph import CalibrationConfig, Tracker, TrackerConfig
 from sst_graph.experiments.markdown import lines
 from sst_graph.odometry.sweep import with_sweep
-from sst_graph.types import Calibration
 from studies.edges_streets import cells, error_of, short, sigma_cells, source_of, start_step
 
 AWAY = np.array([*np.radians([3.0, -4.0, 2.5]), 0.06, -0.08, 0.05])
@@ -55,7 +54,7 @@ def cells_of(name: str, at_once: bool) -> Sequence[str]:
     at_end = time.process_time() - began
     for reason in (*update.contradictions, *(weak.sentence for weak in update.weak_directions)):
         print(f"{name}: {reason}", file=sys.stderr, flush=True)
-    error = error_of(Calibration(update.T_camera_lidar, update.time_offset_s), truth)
+    error = error_of(update.calibration, truth)
     worst = float(np.abs(error / update.sigmas).max())
     milliseconds = 1e3 * np.array(seconds)
     return (

@@ -140,9 +140,9 @@ class Recording:
         if update.frame is not None:
             self._at(update.frame, update.stamp_ns)
         if self._reference is None:
-            self._reference = Calibration(update.T_camera_lidar, update.time_offset_s)
+            self._reference = update.calibration
         if update.covariance is not None:
-            self.estimate(update.T_camera_lidar, update.time_offset_s, update.sigmas)
+            self.estimate(update.calibration, update.sigmas)
         rr = self._rr
         self._log("tracker/matches", rr.Scalars([update.matches]))
         if update.chi2 is not None:
@@ -152,16 +152,15 @@ class Recording:
             self._said = said
             self._log("tracker/log", rr.TextLog(_sentence(update), level=_level(update)))
 
-    def estimate(self, cTl: gtsam.Pose3, time_offset_s: float, sigmas: FloatArray) -> None:
+    def estimate(self, calibration: Calibration, sigmas: FloatArray) -> None:
         """Extrinsic and time offset against the first ones, with 2 sigma.
 
         Args:
             sigmas: (7,) [rad, m, s].
         """
         if self._reference is None:
-            self._reference = Calibration(cTl, time_offset_s)
-        start, offset_s = self._reference
-        change = HUMAN * np.array([*gtsam.Pose3.Logmap(start.inverse() * cTl), time_offset_s - offset_s])
+            self._reference = calibration
+        change = HUMAN * self._reference.local_coordinates(calibration)
         band = 2.0 * HUMAN * sigmas
         for entity, value, width in zip(UNKNOWNS, change, band, strict=True):
             self._log(f"estimate/{entity}", self._rr.Scalars([value, value - width, value + width]))
