@@ -8,6 +8,7 @@ import small_gicp
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
+from sst_graph.factors.motion import cross_rows
 from sst_graph.sampling import spread_places
 from sst_graph.types import FloatArray, Scan
 
@@ -28,16 +29,9 @@ def compensate_sweep(points: FloatArray, offsets_s: FloatArray, twist: FloatArra
         truncation is 2e-5 of the range.
     """
     omega, v = twist[:3], twist[3:]
-    rate = _turned(omega, points) + v
+    rate = cross_rows(omega, points) + v
     t = offsets_s[:, None]
-    return np.asarray(points + t * (rate + 0.5 * t * _turned(omega, rate)))
-
-
-def _turned(omega: FloatArray, points: FloatArray) -> FloatArray:
-    """(n, 3) omega x points; several times faster than ``np.cross``."""
-    a, b, c = omega
-    x, y, z = points.T
-    return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=1)
+    return np.asarray(points + t * (rate + 0.5 * t * cross_rows(omega, rate)))
 
 
 FEWEST_POINTS = 11

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from sst_graph.factors.motion import cross
+from sst_graph.factors.motion import cross, cross_rows
 from sst_graph.odometry.cloud import compensate_sweep, usable_points
 from sst_graph.odometry.lidar import GROUND_CLASSES, TESTED_CLASSES, LidarOdometry, orthonormal
 from sst_graph.odometry.static_points import on_static_objects
@@ -340,9 +340,7 @@ class Window:
             points, own = posed[scan].points.take(index, axis=0), sign * (normals @ R)
             of_poses[:, at : at + 3] = cross(points.T, own.T).T
             of_poses[:, at + 3 : at + 6] = own
-            rate = (
-                np.ascontiguousarray(cross(posed[scan].twist[:3, None], points.T).T) + posed[scan].twist[3:]
-            )
+            rate = cross_rows(posed[scan].twist[:3], points) + posed[scan].twist[3:]
             per_turn = self.period_s * np.einsum("ij,ij->i", own, rate)
             surfaces = self._surfaces[scan]
             of_times[:, 0] += per_turn * surfaces.behind[index]
