@@ -11,7 +11,7 @@ from sst_graph.odometry.lidar import LidarOdometry
 from sst_graph.types import FloatArray, RelativeMotion
 
 
-class DriveMotion:
+class DriveOdometry:
     """LiDAR odometry that goes along as frames are asked for; each scan is registered once."""
 
     def __init__(self, drive: RecentReader) -> None:
