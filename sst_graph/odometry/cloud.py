@@ -43,6 +43,11 @@ def transformed_points(aTb: gtsam.Pose3, bPs: FloatArray) -> FloatArray:
     return np.asarray(bPs @ aTb.rotation().matrix().T + aTb.translation())
 
 
+def transformed_by(aTb: FloatArray, bPs: FloatArray) -> FloatArray:
+    """:func:`transformed_points` by a (4, 4) matrix."""
+    return np.asarray(bPs @ aTb[:3, :3].T + aTb[:3, 3])
+
+
 def usable_points(
     scan: Scan, near_m: float, far_m: float, most: int
 ) -> tuple[FloatArray, NDArray[np.uint8], FloatArray | None]:

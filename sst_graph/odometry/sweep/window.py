@@ -22,7 +22,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from sst_graph.factors.motion import cross, cross_rows
-from sst_graph.odometry.cloud import compensate_sweep, usable_points
+from sst_graph.odometry.cloud import compensate_sweep, transformed_by, usable_points
 from sst_graph.odometry.lidar import GROUND_CLASSES, TESTED_CLASSES, LidarOdometry, orthonormal
 from sst_graph.odometry.static_points import on_static_objects
 from sst_graph.sampling import spread_places
@@ -187,10 +187,7 @@ class Window:
         """Points of each scan on the ground and static objects (in its LiDAR frame) [m]."""
         found = []
         parts = [usable_points(scan, _NEAR_M, _FAR_M, _MAX_POINTS)[:2] for scan in scans]
-        world = [
-            points @ pose[:3, :3].T + pose[:3, 3]
-            for (points, _), pose in zip(parts, self._poses, strict=True)
-        ]
+        world = [transformed_by(pose, points) for (points, _), pose in zip(parts, self._poses, strict=True)]
         raised = [np.isin(classes, GROUND_CLASSES, invert=True) for _, classes in parts]
         for k, (points, classes) in enumerate(parts):
             # An object is static if it is where it is in a scan a third of the window earlier or later.
@@ -234,7 +231,7 @@ class Window:
         for surfaces, twist, pose in zip(self._surfaces, self.twists, self._poses, strict=True):
             share = turned(surfaces.azimuths, start_rad) - 0.5
             points = compensate_sweep(surfaces.points, fraction * self.period_s * share, twist)
-            world = points @ pose[:3, :3].T + pose[:3, 3]
+            world = transformed_by(pose, points)
             # For few queries: balancing it takes longer than they do.
             posed.append(_PosedScan(points, cKDTree(world, balanced_tree=False, compact_nodes=False), twist))
         count = len(self._poses)
