@@ -235,16 +235,16 @@ def edge_ways(work: DriveWork) -> Ways:
     paired = work.edges.paired(state)
     assert paired is not None
     paired = replace(paired, velocities=None)
-    at = state.cTl, state.time_offset_s(0)
+    at = state.calibration()
     compiled = CompiledEdges(paired, KERNEL, config)
-    ours, fused = match_edges(paired, *at, KERNEL, config), compiled.match(*at)
+    ours, fused = match_edges(paired, at, KERNEL, config), compiled.match(*at)
     for name in ("index", "sides", "bounds", "seen"):
         np.testing.assert_array_equal(getattr(ours, name), getattr(fused, name))
     for name in ("lPs", "base_taus_s", "c_acceleration", "pixels", "normals", "sigmas_px", "weights"):
         each = (getattr(matches.alignment, name) for matches in (ours, fused))
         np.testing.assert_allclose(*each, atol=1e-3)
     return {
-        OURS: lambda: match_edges(paired, *at, KERNEL, config),
+        OURS: lambda: match_edges(paired, at, KERNEL, config),
         COMPILED: lambda: compiled.match(*at),
         LOOP: lambda: compiled.alone(*at),
     }

@@ -10,7 +10,6 @@ import dataclasses
 import io
 import shutil
 import sys
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,6 @@ POINTS = np.dtype(
 )
 
 Rng = np.random.Generator
-Attempt = Callable[[Path, Rng], None]
 
 
 def write_layouts(odometry: Path, folder: Path) -> None:
@@ -171,10 +169,10 @@ def array_file(rng: Rng, data: bytes) -> bytes:
     return stream.getvalue()
 
 
-def npy_of(header: str, count: int = 48) -> bytes:
+def npy_of(header: str) -> bytes:
     """A .npy file of a header that NumPy would not write, and of zeros behind it."""
     written = header.encode()
-    return b"\x93NUMPY\x01\x00" + len(written).to_bytes(2, "little") + written + bytes(count)
+    return b"\x93NUMPY\x01\x00" + len(written).to_bytes(2, "little") + written + bytes(48)
 
 
 HEADERS = (

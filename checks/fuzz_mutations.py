@@ -13,7 +13,7 @@ import socket
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -404,14 +404,11 @@ def _palette(eight: np.ndarray) -> bytes:
         (b"IDAT", zlib.compress(rows)),
         (b"IEND", b""),
     )
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(part)) + kind + part + struct.pack(">I", zlib.crc32(kind + part))
-        for kind, part in parts
-    )
+    return png_of(parts)
 
 
 def _png(rng: Rng, data: bytes) -> bytes:
-    chunks = _chunks(data)
+    chunks = png_chunks(data)
     action = int(rng.integers(6))
     if action <= 1:
         fields = list(struct.unpack(">IIBBBBB", chunks[0][1]))
@@ -432,6 +429,11 @@ def _png(rng: Rng, data: bytes) -> bytes:
         chunks.insert(int(rng.integers(len(chunks) + 1)), (kind, rng.bytes(int(rng.integers(0, 40)))))
     else:
         chunks = [chunks[i] for i in rng.permutation(len(chunks))]
+    return png_of(chunks)
+
+
+def png_of(chunks: Iterable[tuple[bytes, bytes]]) -> bytes:
+    """A PNG file of chunks, each with its right checksum."""
     body = (
         struct.pack(">I", len(part)) + kind + part + struct.pack(">I", zlib.crc32(kind + part))
         for kind, part in chunks
@@ -439,7 +441,8 @@ def _png(rng: Rng, data: bytes) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + b"".join(body)
 
 
-def _chunks(data: bytes) -> list[tuple[bytes, bytes]]:
+def png_chunks(data: bytes) -> list[tuple[bytes, bytes]]:
+    """Kind and content of each chunk of a PNG file."""
     at, found = 8, []
     while at < len(data):
         (length,) = struct.unpack_from(">I", data, at)

@@ -75,6 +75,12 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return out
 
 
+def cross_rows(a: FloatArray, b: FloatArray) -> FloatArray:
+    """(n, 3) a x b of rows (n, 3), one of which may be a single vector (3,)."""
+    (ax, ay, az), (bx, by, bz) = a.T, b.T
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
+
+
 def _series_table() -> FloatArray:
     """(terms, 4): coefficients of x^m in b, c, db/dx, dc/dx of :func:`exponential_coefficients`."""
     table = np.zeros((_TERMS, 4))

@@ -7,14 +7,13 @@ It stays in memory beside the result (:attr:`sst_graph.result.CalibrationResult.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.types import ByValue, FloatArray, IntArray
+from sst_graph.types import ByValue, Calibration, FloatArray, IntArray
 
 CLOSE_PX = 1.5
 """A boundary point closer to its contour than this counts as close [px].
@@ -137,21 +136,17 @@ class PointResiduals(ByValue):
         return PointResiduals(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
 
-@dataclass(frozen=True)
-class OuterIteration:
-    """One outer iteration of the solution.
+@dataclass(frozen=True, eq=False)
+class OuterIteration(Calibration):
+    """One outer iteration of the solution: the extrinsic and the (first) time offset after it.
 
     Attributes:
         kernel_px: scale of the robust kernel [px]; None of motions.
         matches: number of matches, or of pairs of motions.
-        cTl: extrinsic after it.
-        time_offset_s: (first) time offset after it [s].
     """
 
-    kernel_px: float | None
-    matches: int
-    cTl: gtsam.Pose3
-    time_offset_s: float
+    kernel_px: float | None = field(kw_only=True)
+    matches: int = field(kw_only=True)
 
 
 @dataclass(frozen=True, eq=False)

@@ -151,6 +151,11 @@ class CalibrationMarginal(ByValue):
         values.insert(D_key, np.array([self.time_offset_s]))
         return values
 
+    @property
+    def at(self) -> Calibration:
+        """The linearization point."""
+        return Calibration(self.cTl, self.time_offset_s)
+
     def covariance(self) -> FloatArray:
         """(7, 7) inverse of the information.
 
@@ -165,8 +170,7 @@ class CalibrationMarginal(ByValue):
         Raises:
             EstimationError: a direction without information.
         """
-        d = self.covariance() @ self.vector
-        return Calibration(self.cTl.retract(d[:6]), self.time_offset_s + float(d[6]))
+        return self.at.retract(self.covariance() @ self.vector)
 
     def plus(self, other: CalibrationMarginal) -> CalibrationMarginal:
         """Both costs together, at this one's linearization point; exact where the two share it.
@@ -178,7 +182,7 @@ class CalibrationMarginal(ByValue):
         checked_type("a marginal plus another", other, CalibrationMarginal, "a CalibrationMarginal")
         if self.common.errors or other.common.errors:
             return replace(self, **vars(separated(self).plus(separated(other)).together()))
-        there = other if self.shares_point(other) else carried(other, self.cTl, self.time_offset_s)
+        there = other if self.shares_point(other) else carried(other, self.at)
         return replace(
             self,
             information=self.information + there.information,
@@ -257,10 +261,10 @@ class Separated:
     own: CalibrationMarginal
     errors: Mapping[str, FloatArray]
 
-    def carried(self, cTl: gtsam.Pose3, time_offset_s: float) -> Separated:
+    def carried(self, to: Calibration) -> Separated:
         """The same about another point."""
-        _, J = _moved(self.own, cTl, time_offset_s)
-        return Separated(carried(self.own, cTl, time_offset_s), _steps_there(self.errors, J))
+        _, J = _moved(self.own, to)
+        return Separated(carried(self.own, to), _steps_there(self.errors, J))
 
     def plus(self, other: Separated) -> Separated:
         """Both together, at this one's point.
@@ -269,7 +273,7 @@ class Separated:
             EstimationError: errors in common, and a direction without information.
         """
         if not self.own.shares_point(other.own):
-            other = other.carried(self.own.cTl, self.own.time_offset_s)
+            other = other.carried(self.own.at)
         return Separated(self.own.plus(other.own), weighted_steps([self, other]))
 
     def covariance(self) -> FloatArray:
@@ -463,14 +467,14 @@ def _symmetric(unit: FloatArray) -> bool:
     return bool((np.abs(unit - unit.T) <= 1e-6).all())
 
 
-def carried(marginal: CalibrationMarginal, cTl: gtsam.Pose3, time_offset_s: float) -> CalibrationMarginal:
+def carried(marginal: CalibrationMarginal, to: Calibration) -> CalibrationMarginal:
     """The same cost, expanded about another point: d_0 = shift + J d, J the derivative of Log(T0^-1 T
     Exp(d))."""
-    shift, J = _moved(marginal, cTl, time_offset_s)
+    shift, J = _moved(marginal, to)
     L, g = marginal.information, marginal.vector
     constant = marginal.constant - 2.0 * float(g @ shift) + float(shift @ L @ shift)
     common = replace(marginal.common, errors=_steps_there(marginal.common.errors, J))
-    return CalibrationMarginal(cTl, time_offset_s, J.T @ L @ J, J.T @ (g - L @ shift), constant, common)
+    return CalibrationMarginal(to.cTl, to.time_offset_s, J.T @ L @ J, J.T @ (g - L @ shift), constant, common)
 
 
 def _steps_there(errors: Mapping[str, FloatArray], J: FloatArray) -> dict[str, FloatArray]:
@@ -481,19 +485,11 @@ def _steps_there(errors: Mapping[str, FloatArray], J: FloatArray) -> dict[str, F
     return dict(zip(errors, np.asarray(there), strict=True))
 
 
-def _moved(
-    marginal: CalibrationMarginal, cTl: gtsam.Pose3, time_offset_s: float
-) -> tuple[FloatArray, FloatArray]:
+def _moved(marginal: CalibrationMarginal, to: Calibration) -> tuple[FloatArray, FloatArray]:
     """Shift (7,) and J (7, 7) of d_0 = shift + J d, from a marginal's point to another."""
-    J = np.eye(7)
-    step, J[:6, :6] = _log(marginal.cTl.between(cTl))
-    return np.append(step, time_offset_s - marginal.time_offset_s), J
-
-
-def _log(pose: gtsam.Pose3) -> tuple[FloatArray, FloatArray]:
-    """Log of a pose and its derivative (6, 6) by a right perturbation."""
-    xi = np.asarray(gtsam.Pose3.Logmap(pose))
-    return xi, np.asarray(gtsam.Pose3.LogmapDerivative(xi))
+    step, J = marginal.at.local_coordinates(to), np.eye(7)
+    J[:6, :6] = gtsam.Pose3.LogmapDerivative(step[:6])
+    return step, J
 
 
 def inverse(matrix: FloatArray, what: str) -> FloatArray:

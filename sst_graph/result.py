@@ -31,7 +31,7 @@ from sst_graph.files.json_table import JsonTable, json_table
 from sst_graph.files.reading import CALIBRATION, parse_json, path_of, read_text
 from sst_graph.files.strict_json import strict_json
 from sst_graph.fit import Fit
-from sst_graph.types import ByValue, FloatArray
+from sst_graph.types import ByValue, Calibration, FloatArray
 
 Status = Literal["ok", "unobservable", "not_converged"]
 
@@ -186,6 +186,11 @@ class CalibrationResult:
 
     def __hash__(self) -> int:
         return hash(self.to_json())
+
+    @property
+    def calibration(self) -> Calibration:
+        """``T_camera_lidar`` and ``time_offset_s`` as one."""
+        return Calibration(self.T_camera_lidar, self.time_offset_s)
 
     @property
     def image_topic(self) -> str:

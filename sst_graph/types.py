@@ -231,6 +231,10 @@ class Calibration(ByValue):
         xi = gtsam.Pose3.Logmap(self.cTl.between(other.cTl))
         return np.append(np.asarray(xi, dtype=np.float64), other.time_offset_s - self.time_offset_s)
 
+    def retract(self, step: FloatArray) -> Calibration:
+        """The calibration a step (7,) away, as :meth:`local_coordinates` has it."""
+        return Calibration(self.cTl.retract(step[:6]), self.time_offset_s + float(step[6]))
+
     def __iter__(self) -> Iterator[Any]:
         return iter((self.cTl, self.time_offset_s))
 

@@ -16,8 +16,7 @@ import numpy as np
 
 from sst_graph import calibrate
 from sst_graph.data import DriveProperties, Sensor, SourceOptions, merged
-from sst_graph.experiments.starts import start_near
-from sst_graph.metrics import calibration_errors
+from sst_graph.experiments.starts import errors_of, start_near
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
 from sst_graph.types import Source
 
@@ -43,7 +42,7 @@ def run(seed: int, scans: int, images_hz: int) -> np.ndarray:
     street = simulate(config)
     start = start_near(street.truth.cTl, 10.0, 0.1, np.random.default_rng([seed, 11]))
     result = calibrate(drive_of(street, images_hz), start)
-    errors = calibration_errors(result.T_camera_lidar, result.time_offset_s, street.truth, result.covariance)
+    errors = errors_of(result, street.truth)
     step = gtsam.Pose3.Logmap(result.T_camera_lidar.between(street.truth.cTl))
     error = np.append(step, TIME_OFFSET_S - result.time_offset_s)
     nees = float(error @ np.linalg.solve(result.covariance, error))

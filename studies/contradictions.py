@@ -85,8 +85,7 @@ def contradictions_of(source: Source, start: State) -> Contradictions:
     config = CalibrationConfig()
     noise = replace(config.noise, lower_edges=tuple(config.classes))
     drives = prepare_drives([source], config)
-    guess = Guess(start.cTl, start.time_offsets_s[0])
-    problem = CalibrationProblem.of(drives, guess, replace(config, noise=noise))
+    problem = CalibrationProblem.of(drives, Guess(*start.calibration()), replace(config, noise=noise))
     solution = solve_joint(problem.joint(), start, NARROW_KERNELS_PX)
     return find_contradictions(PartSolver(problem, solution.state))
 

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from sst_graph import CalibrationConfig, calibrate
-from sst_graph.metrics import calibration_errors
+from sst_graph.experiments.starts import errors_of
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, scenery, simulate
 from sst_graph.simulator.mesh import box_triangles, soup
 from sst_graph.simulator.street import Street, _assembled, _Builder
@@ -81,9 +81,7 @@ def main() -> None:
             )
             drive = drive_through(scene, config)
             result = calibrate(drive, drive.truth.cTl.retract(START), CalibrationConfig(method="edges"))
-            errors = calibration_errors(
-                result.T_camera_lidar, result.time_offset_s, drive.truth, result.covariance
-            )
+            errors = errors_of(result, drive.truth)
             found = f"{errors.qad_deg:.2f} | {100 * errors.atd_m:.1f} | {result.status}"
             print(f"| {scene} | {seed} | {found} |", flush=True)
             for reason in result.reasons:

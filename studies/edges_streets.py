@@ -15,14 +15,13 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph import CalibrationConfig, calibrate, open_source
 from sst_graph.experiments.markdown import lines, table
 from sst_graph.simulator import SimulationConfig, simulate
-from sst_graph.types import GroundTruth, Source
+from sst_graph.types import Calibration, GroundTruth, Source
 from studies.simulators.third_street import ThirdConfig, ThirdStreet
 
 FloatArray = NDArray[np.float64]
@@ -80,10 +79,10 @@ def sigma_cells(covariance: FloatArray) -> tuple[str, str, str]:
     return rotation.replace("+", ""), translation.replace("+", ""), offset.replace("+", "")
 
 
-def error_of(T_camera_lidar: gtsam.Pose3, time_offset_s: float, truth: GroundTruth) -> FloatArray:
+def error_of(estimate: Calibration, truth: GroundTruth) -> FloatArray:
     """(7,) from the truth to an estimate, in the LiDAR's axes [rad, m, s]."""
-    step = gtsam.Pose3.Logmap(truth.cTl.between(T_camera_lidar))
-    return np.append(step, time_offset_s - truth.time_offset_s)
+    assert truth.time_offset_s is not None
+    return Calibration(truth.cTl, truth.time_offset_s).local_coordinates(estimate)
 
 
 def nees_of(error: FloatArray, covariance: FloatArray) -> float:
@@ -107,7 +106,7 @@ def rows(
         start = truth.cTl.retract(start_step(name)) if guessed else None
         result = calibrate(source, start, CalibrationConfig(method="edges"))
         seconds = time.process_time() - began
-        error = error_of(result.T_camera_lidar, result.time_offset_s, truth)
+        error = error_of(result.calibration, truth)
         nees = nees_of(error, result.covariance)
         found.append((error * UNITS, nees))
         for reason in result.reasons:

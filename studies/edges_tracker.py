@@ -54,7 +54,7 @@ def cells_of(name: str, at_once: bool) -> Sequence[str]:
     at_end = time.process_time() - began
     for reason in (*update.contradictions, *(weak.sentence for weak in update.weak_directions)):
         print(f"{name}: {reason}", file=sys.stderr, flush=True)
-    error = error_of(update.T_camera_lidar, update.time_offset_s, truth)
+    error = error_of(update.calibration, truth)
     worst = float(np.abs(error / update.sigmas).max())
     milliseconds = 1e3 * np.array(seconds)
     return (

@@ -178,11 +178,11 @@ def calibrate_in_this_process(drives: Sequence[Path], out: Path) -> None:
             main_of_program(["calibrate", str(drive), "--out", str(out / drive.name), *SETTINGS])
 
 
-def batch_command(drives: Path, out: Path, workers: int = 2, dask: str = "") -> list[str]:
+def batch_command(drives: Path, out: Path, dask: str = "") -> list[str]:
     """The command line of the batch."""
     named = ["--vehicle-from", r"(?P<vehicle>v\d+)_(?P<date>[\d-]+)$"]
     named += ["--dask", dask] if dask else []
-    return [*PROGRAM, "batch", str(drives), "--out", str(out), "--workers", str(workers), *named, *SETTINGS]
+    return [*PROGRAM, "batch", str(drives), "--out", str(out), "--workers", "2", *named, *SETTINGS]
 
 
 def run_batch(command: Sequence[str]) -> tuple[int, float, float]:

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from sst_graph.batch import calibrate_prepared, prepare_drives
 from sst_graph.errors import ContradictionError
 from sst_graph.export import CalibrationMarginal, Common, fuse_marginals, marginal_of_result
+from sst_graph.types import Calibration
 from studies.small_streets import CONFIG, FIRST_SEED, drawn, street
 
 FloatArray = NDArray[np.float64]
@@ -47,8 +48,7 @@ def marginal_of(seed: int, vehicle: int) -> CalibrationMarginal | None:
 
 def nees(marginal: CalibrationMarginal) -> float:
     """Squared error over its covariance, over its dimension."""
-    best = marginal.best()
-    error = np.append(_REFERENCE.localCoordinates(best.cTl), best.time_offset_s)
+    error = Calibration(_REFERENCE).local_coordinates(marginal.best())
     return float(error @ np.linalg.solve(marginal.covariance(), error)) / len(error)
 
 

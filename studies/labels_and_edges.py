@@ -24,7 +24,7 @@ from sst_graph.batch.method_estimate import MethodEstimate
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.experiments.markdown import lines
 from sst_graph.result import CalibrationResult
-from sst_graph.types import Frame, SemanticClass
+from sst_graph.types import Calibration, Frame, SemanticClass
 from studies.edges_streets import (
     FloatArray,
     cells,
@@ -75,9 +75,9 @@ def part(name: str, kept: str) -> Iterator[Sequence[str]]:
     for kind in ("labels", "edges"):
         if kind in said:
             pose = gtsam.Pose3(np.array(said[kind]["T_camera_lidar"]))
-            error = error_of(pose, said[kind]["time_offset_s"], truth)
+            error = error_of(Calibration(pose, said[kind]["time_offset_s"]), truth)
             yield row(name, kind, error, np.diag(np.square(said[kind]["sigmas"])))
-    error = error_of(result.T_camera_lidar, result.time_offset_s, truth)
+    error = error_of(result.calibration, truth)
     yield row(name, result.method, error, result.covariance, result.status)
     for reason in result.reasons:
         print(f"{name}: {reason}", file=sys.stderr, flush=True)
@@ -96,15 +96,15 @@ def same(name: str) -> Iterator[Sequence[str]]:
     start = truth.cTl.retract(start_step(name))
     results = {by: calibrate(source, start, config) for by, config in configs.items()}
     for by, result in results.items():
-        error = error_of(result.T_camera_lidar, result.time_offset_s, truth)
+        error = error_of(result.calibration, truth)
         yield row(name, by, error, result.covariance, result.status)
     fused = Fused.of(estimate_of(results["joint, no motion"]), estimate_of(results["edges"]))
-    error = error_of(fused.state.cTl, fused.state.time_offsets_s[0], truth)
+    error = error_of(fused.state.calibration(), truth)
     yield row(name, "product", error, fused.covariance, f"chi-squared of 7: {fused.chi2:.1f}")
 
 
 def estimate_of(result: CalibrationResult) -> MethodEstimate:
-    return MethodEstimate(result.T_camera_lidar, result.time_offset_s, result.covariance, ())
+    return MethodEstimate(*result.calibration, result.covariance, ())
 
 
 def main() -> None:

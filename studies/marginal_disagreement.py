@@ -22,6 +22,7 @@ from sst_graph.factors import (
     time_offset_prior,
     velocity_factor,
 )
+from sst_graph.types import Calibration
 
 FloatArray = NDArray[np.float64]
 E, D = gtsam.symbol("E", 0), gtsam.symbol("D", 0)
@@ -71,10 +72,8 @@ def pair(seed: int, apart: float) -> tuple[float, list[float]]:
     way = rng.standard_normal(7)
     step = np.sqrt(2.0) * apart * np.linalg.cholesky(C_1) @ (way / np.linalg.norm(way))
     graph_2, values_2 = drive(2 * seed + 2, RIG.retract(step[:6]), 0.1 + step[6])
-    difference = _between(
-        values_1.atPose3(E), values_1.atVector(D)[0], values_2.atPose3(E), values_2.atVector(D)[0]
-    )
-    distance = _length(difference, C_1 + _covariance(graph_2, values_2))
+    one, other = (Calibration(v.atPose3(E), float(v.atVector(D)[0])) for v in (values_1, values_2))
+    distance = _length(one.local_coordinates(other), C_1 + _covariance(graph_2, values_2))
     graphs = [(graph_1, values_1), (graph_2, values_2)]
     joint, _ = fuse_graphs(graphs, E, D, significance=0.0)
     fused = fuse_marginals(
@@ -82,8 +81,7 @@ def pair(seed: int, apart: float) -> tuple[float, list[float]]:
     )
     misses = [_miss(joint, fused)]
     for _ in range(ROUNDS):
-        at = fused.cTl, fused.time_offset_s
-        again = [marginal_of_graph(graph, values, E, D, at=at) for graph, values in graphs]
+        again = [marginal_of_graph(graph, values, E, D, at=fused.at) for graph, values in graphs]
         fused = fuse_marginals(again, significance=0.0)
         misses.append(_miss(joint, fused))
     return distance, misses
@@ -94,16 +92,12 @@ def _covariance(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Floa
     return 0.5 * (found + found.T)
 
 
-def _between(cTl_1: gtsam.Pose3, offset_1: float, cTl_2: gtsam.Pose3, offset_2: float) -> FloatArray:
-    return np.append(cTl_1.localCoordinates(cTl_2), offset_2 - offset_1)
-
-
 def _length(step: FloatArray, covariance: FloatArray) -> float:
     return float(np.sqrt(step @ np.linalg.solve(covariance, step)))
 
 
 def _miss(joint: CalibrationMarginal, fused: CalibrationMarginal) -> float:
-    step = _between(joint.cTl, joint.time_offset_s, fused.cTl, fused.time_offset_s)
+    step = joint.at.local_coordinates(fused.at)
     return float(np.sqrt(step @ joint.information @ step))
 
 

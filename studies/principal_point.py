@@ -46,7 +46,7 @@ def main() -> None:
                 believed = {n: replace(ASSUMPTIONS[n], prevalence=prevalence) for n in ("cx", "cy")}
                 with mock.patch.dict(ASSUMPTIONS, believed):
                     result = calibrate_prepared(drives, start, config)
-                error = error_of(result.T_camera_lidar, result.time_offset_s, truth)
+                error = error_of(result.calibration, truth)
                 worst = float(np.abs(error / np.sqrt(np.diag(result.covariance))).max())
                 nees, rotation = nees_of(error, result.covariance), sigma_cells(result.covariance)[0]
                 print(

@@ -23,7 +23,7 @@ from sst_graph.batch.calibrate import finished, joint_method, prepare_drives
 from sst_graph.covariance.image_shifts import image_shifts
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.types import Guess
-from studies.edges_streets import source_of, start_step
+from studies.edges_streets import error_of, source_of, start_step
 from studies.subtle_faults import with_numbered_images
 
 FloatArray = NDArray[np.float64]
@@ -70,10 +70,7 @@ def outcome_of(drive: KeptDrive, start: gtsam.Pose3) -> Outcome:
     solved = estimate.solved.estimate
     last = solved.solution
     shifts = image_shifts(solved.robust, last.pairs, last.values, last.state)
-    error = np.append(
-        gtsam.Pose3.Logmap(truth.cTl.between(result.T_camera_lidar)),
-        result.time_offset_s - truth.time_offset_s,
-    )
+    error = error_of(result.calibration, truth)
     covariances = result.covariance - shifts.covariance[:7, :7], result.covariance
     nees = np.array([float(error @ np.linalg.solve(C, error)) for C in covariances])
     worst = np.array([np.abs(error / np.sqrt(np.diag(C))).max() for C in covariances])

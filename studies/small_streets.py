@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
-import gtsam
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent / "simulators"))
@@ -29,6 +28,7 @@ from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drives
 from sst_graph.config import with_overrides
 from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.experiments.starts import error_of
 from sst_graph.experiments.tasks.resumable import Work, rows_of
 from sst_graph.experiments.wrong_drives import WRONG
 from sst_graph.simulator import SimulationConfig, simulate
@@ -115,8 +115,7 @@ def row(seed: int, simulator: str, case: str, drive: KeptDrive) -> Row:
     """The calibration of a drive."""
     result = calibrate_prepared(prepare_drives([drive], CONFIG), drive.nominal, CONFIG)
     assert drive.truth is not None
-    late_s = (drive.truth.time_offset_s or 0.0) - result.time_offset_s
-    error = np.append(gtsam.Pose3.Logmap(result.T_camera_lidar.between(drive.truth.cTl)), late_s)
+    error = error_of(result.calibration, drive.truth)
     tested = {n: e for n, e in result.diagnostics.get("assumptions", {}).items() if "estimate" in e}
     return Row(
         seed,

@@ -17,12 +17,12 @@ import time
 from typing import Any
 
 import cv2
-import gtsam
 import numpy as np
 
 from sst_graph import CalibrationConfig, calibrate
 from sst_graph.odometry.sweep import FRACTIONS, SweepDecision, decide_sweep
 from sst_graph.simulator import SimulationConfig, simulate
+from sst_graph.types import Calibration
 
 
 def street(seed: int, output: str, frames: int) -> SimulationConfig:
@@ -85,10 +85,7 @@ def errors(config: SimulationConfig, timed: bool) -> tuple[list[float], str, str
     away = np.random.default_rng([config.seed, 99]).uniform(-1.0, 1.0, 6) * np.repeat([0.08, 0.05], 3)
     result = calibrate(drive, truth.cTl.retract(away), CalibrationConfig())
     assert truth.time_offset_s is not None
-    error = np.append(
-        gtsam.Pose3.Logmap(truth.cTl.between(result.T_camera_lidar)),
-        result.time_offset_s - truth.time_offset_s,
-    )
+    error = Calibration(truth.cTl, truth.time_offset_s).local_coordinates(result.calibration)
     figures = [
         float(np.degrees(np.linalg.norm(error[:3]))),
         float(100.0 * np.linalg.norm(error[3:6])),

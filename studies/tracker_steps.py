@@ -24,7 +24,7 @@ import numpy as np
 from sst_graph import Tracker
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
 from sst_graph.simulator.config import Motion
-from sst_graph.types import CameraImage, Frame
+from sst_graph.types import Calibration, CameraImage, Frame
 
 GUESS = np.array([0.02, -0.02, 0.02, 0.05, -0.05, 0.05])
 MOTIONS: tuple[Motion, ...] = ("mixed", "no_stop", "turning", "constant", "stop_and_go")
@@ -72,17 +72,15 @@ STEPS = (
 def _frames_of(tracker: Tracker, frames: list[Frame], step: Step, drive: SimulatedDrive) -> str:
     """Cells: the alarm's frame; suspected, unconfirmed, silent frames; status, errors and NEES at the end."""
     alarms, suspected, unconfirmed, silent, speed = [], 0, 0, 0, 0.0
-    truth = gtsam.Pose3(step.rotation, np.zeros(3)) * drive.truth.cTl
-    time_offset_s = (drive.truth.time_offset_s or 0.0) - 1e-3 * step.late_ms
+    turn, late_s = gtsam.Pose3(step.rotation, np.zeros(3)), 1e-3 * step.late_ms
+    truth = Calibration(turn * drive.truth.cTl, (drive.truth.time_offset_s or 0.0) - late_s)
     for k, frame in enumerate(frames):
         assert frame.image is not None
         update = tracker.add(dataclasses.replace(frame, image=step.applied(frame.image, drive)))
         alarms += [k + 1] if update.alarm else []
         suspected += bool(update.suspected_change)
         unconfirmed += update.status == "unconfirmed"
-        error = np.append(
-            gtsam.Pose3.Logmap(update.T_camera_lidar.between(truth)), time_offset_s - update.time_offset_s
-        )
+        error = update.calibration.local_coordinates(truth)
         known = np.diag(update.sigmas**2) if update.covariance is None else update.covariance
         nees = error @ np.linalg.solve(known, error) / 7.0
         silent += update.status == "ok" and not update.suspected_change and nees > SILENT_NEES

@@ -48,17 +48,13 @@ def with_stamps(drive: KeptDrive, factor: int, divisor: int = 1) -> KeptDrive:
     return later.with_images(lambda i: replace(i, stamp_ns=i.stamp_ns * factor // divisor))
 
 
-def with_images_of(
-    drive: KeptDrive, others: Sequence[Frame], masks: bool = True, pictures: bool = True
-) -> KeptDrive:
-    """Images (or only their masks, or pictures) of other frames, at this drive's stamps."""
+def with_images_of(drive: KeptDrive, others: Sequence[Frame], pictures: bool = True) -> KeptDrive:
+    """Images (or only their masks) of other frames, at this drive's stamps."""
     frames = []
     for frame, other in zip(drive.frames, others, strict=False):
         if frame.image is None or other.image is None:
             continue
-        image = frame.image
-        if masks:
-            image = replace(image, mask=other.image.mask, instances=other.image.instances)
+        image = replace(frame.image, mask=other.image.mask, instances=other.image.instances)
         if pictures:
             image = replace(image, pixels=other.image.pixels)
         frames.append(replace(frame, image=image))

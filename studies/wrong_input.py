@@ -28,7 +28,8 @@ from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.diagnosis import preflight
 from sst_graph.errors import SstGraphError
 from sst_graph.experiments.markdown import lines
-from sst_graph.metrics import TruthSigma, calibration_errors, tangent_error
+from sst_graph.experiments.starts import errors_of
+from sst_graph.metrics import TruthSigma, tangent_error
 from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.types import Guess
 
@@ -63,9 +64,7 @@ def row(name: str, drive: KeptDrive, quick: bool) -> tuple[Sequence[str], bool]:
     first = result.reasons[0] if result.reasons else ""
     error_text = ""
     if drive.truth is not None:
-        errors = calibration_errors(
-            result.T_camera_lidar, result.time_offset_s, drive.truth, result.covariance
-        )
+        errors = errors_of(result, drive.truth)
         error_text = f"{errors.qad_deg:.2f} deg, {100.0 * errors.atd_m:.1f} cm"
     named = not any(words in first for words in NAMED.values())
     if name in NAMED:

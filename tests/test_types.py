@@ -28,6 +28,7 @@ def test_the_step_between_calibrations_is_the_right_perturbation() -> None:
     step = np.array([0.02, -0.01, 0.03, 0.1, -0.2, 0.3, 0.004])
     other = Calibration(POSE * gtsam.Pose3.Expmap(step[:6]), 0.05 + step[6])
     np.testing.assert_allclose(Calibration(POSE, 0.05).local_coordinates(other), step, atol=1e-12)
+    assert Calibration(POSE, 0.05).retract(step) == other
 
 
 @pytest.mark.parametrize(

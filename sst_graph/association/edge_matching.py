@@ -15,7 +15,6 @@ from functools import cached_property
 from itertools import pairwise
 from typing import Any, Protocol
 
-import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -28,7 +27,7 @@ from sst_graph.factors.robust import RobustKernel
 from sst_graph.features.lidar_edges import Boundaries, Edge, joined
 from sst_graph.features.mask_contour import ContourFeet, ContourMap, nearest_contours, stretches
 from sst_graph.features.picture_gradients import EdgePlace, PictureGradients, nearest_edges
-from sst_graph.types import BoolArray, FloatArray, IntArray, SemanticClass
+from sst_graph.types import BoolArray, Calibration, FloatArray, IntArray, SemanticClass
 
 _OUTWARD, _LEAST_STRETCH = 0.01, 0.1
 """A pixel that is farther from the principal point by the first fraction must be imaged farther out by at
@@ -174,33 +173,29 @@ class PairedEdges:
         """(g,) points of each group."""
         return np.diff(self.bounds)
 
-    def projected(
-        self, lPs: FloatArray, cTl: gtsam.Pose3, time_offset_s: float, poses: FloatArray | None = None
-    ) -> FloatArray:
+    def projected(self, lPs: FloatArray, at: Calibration, poses: FloatArray | None = None) -> FloatArray:
         """(n, 2) pixels of points (n, 3) of the groups, moved to their images' instant; NaN behind the
         camera. Arguments as in :meth:`moved`."""
-        return self.camera.project(self.moved(lPs, cTl, time_offset_s, poses))
+        return self.camera.project(self.moved(lPs, at, poses))
 
-    def moved(
-        self, lPs: FloatArray, cTl: gtsam.Pose3, time_offset_s: float, poses: FloatArray | None = None
-    ) -> FloatArray:
+    def moved(self, lPs: FloatArray, at: Calibration, poses: FloatArray | None = None) -> FloatArray:
         """(n, 3) points (n, 3) of the groups at their images' instant, in the camera [m].
 
         Args:
             poses: what :meth:`poses` gives, of these or of all points, where it is known.
         """
-        columns, taus = np.ascontiguousarray(lPs.T), time_offset_s + self.base_taus_s
+        columns, taus = np.ascontiguousarray(lPs.T), at.time_offset_s + self.base_taus_s
         if self.velocities is not None:
             columns = columns + taus * self.velocities.T
         if poses is None:
-            poses = self.poses(cTl, time_offset_s)
+            poses = self.poses(at)
         if poses is None:
             rows = self.motion.c_twist, self.motion.c_acceleration
             each = self.motion if rows[0].ndim == 1 else CameraTwist(*(self.repeated(row).T for row in rows))
-            return np.asarray(moved_points(cTl, columns, taus, each, "se3", None).cPs.T)
+            return np.asarray(moved_points(at.cTl, columns, taus, each, "se3", None).cPs.T)
         return transformed(poses, columns, self.bounds).T
 
-    def poses(self, cTl: gtsam.Pose3, time_offset_s: float) -> FloatArray | None:
+    def poses(self, at: Calibration) -> FloatArray | None:
         """(g, 4, 4) pose of the LiDAR in the camera with the motion, of groups that move as one rigid body;
         None where the points of a group have times of their own."""
         if len(self.base_taus_s) == 0:
@@ -208,7 +203,7 @@ class PairedEdges:
         base_taus_s = self.base_taus_s[np.minimum(self.bounds[:-1], len(self.base_taus_s) - 1)]
         if not np.array_equal(self.base_taus_s, self.repeated(base_taus_s)):
             return None
-        return group_poses(cTl, time_offset_s + base_taus_s, self.motion)
+        return group_poses(at.cTl, at.time_offset_s + base_taus_s, self.motion)
 
     def accelerations(self, counts: IntArray) -> FloatArray:
         """(6,) where all groups share it, else (m, 6): of the image of each of so many points a group (g,)
@@ -275,8 +270,7 @@ class ScanWithImage:
 
 def match_silhouettes(
     pair: ScanWithImage,
-    cTl: gtsam.Pose3,
-    time_offset_s: float,
+    at: Calibration,
     biases_px: Mapping[SemanticClass, float],
     kernel: RobustKernel,
     config: MatchConfig,
@@ -309,7 +303,7 @@ def match_silhouettes(
         np.array([biases_px.get(c, 0.0) for c in classes]),
         moving,
     )
-    found = match_edges(paired, cTl, time_offset_s, kernel, config)
+    found = match_edges(paired, at, kernel, config)
     return {
         c: SilhouetteMatches(
             found.alignment if b - a == len(found.index) else found.alignment.take(np.arange(a, b)),
@@ -336,8 +330,7 @@ def numbered_through(objects: Sequence[IntArray]) -> IntArray:
 
 def match_edges(
     paired: PairedEdges,
-    cTl: gtsam.Pose3,
-    time_offset_s: float,
+    at: Calibration,
     kernel: RobustKernel,
     config: MatchConfig,
     deviation: PointDeviation | None = None,
@@ -350,19 +343,19 @@ def match_edges(
             camera.
     """
     # 1. Project the points into their images.
-    poses = paired.poses(cTl, time_offset_s)
-    uvs, shift = paired.projected(paired.points.lPs, cTl, time_offset_s, poses), None
+    poses = paired.poses(at)
+    uvs, shift = paired.projected(paired.points.lPs, at, poses), None
     if deviation is not None:
         effect = _effect(deviation, paired, uvs)
         if effect.l_shift is not None or effect.time_s is not None:
             paired, poses = _deviated(paired, effect), None
-            uvs = paired.projected(paired.points.lPs, cTl, time_offset_s)
+            uvs = paired.projected(paired.points.lPs, at)
             effect = _effect(deviation, paired, uvs)
         ideal, shift = uvs, _pixel_shift(deviation, paired, uvs, effect)
         uvs = ideal + shift
     index = np.flatnonzero(paired.camera.in_image(uvs))
     some, uvs = paired.take(index), uvs.take(index, axis=0)
-    outer = some.projected(some.points.outward, cTl, time_offset_s, poses)
+    outer = some.projected(some.points.outward, at, poses)
     objects_seen = np.bincount(some.owners)
     # 2. Find the nearest contours within the gate.
     if any(isinstance(contour, PictureGradients) for contour in paired.contours):

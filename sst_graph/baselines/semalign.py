@@ -15,6 +15,7 @@ from scipy.ndimage import distance_transform_edt
 from sst_graph.baselines.nearest_pixel_frames import MatchFrame, frozen_covariance, step_once
 from sst_graph.baselines.sst_calib import NearestSolution, PaperProblem, still_frames
 from sst_graph.factors import PinholeCamera
+from sst_graph.sampling import step_for
 from sst_graph.types import Calibration, FloatArray
 
 BOX_DEG, BOX_M = 10.0, 0.1
@@ -78,7 +79,7 @@ def truncated_distances(
     R = np.stack([pose.rotation().matrix() for pose in poses])
     t = np.stack([pose.translation() for pose in poses])
     for view in frame.views:
-        lPs = view.lPs[:: max(1, -(-len(view.lPs) // _POINTS))]
+        lPs = view.lPs[:: step_for(len(view.lPs), _POINTS)]
         h, w = view.nearest.index.shape
         on_class = view.nearest.index == np.arange(h * w).reshape(h, w)
         distance = np.minimum(distance_transform_edt(~on_class), truncation_px)

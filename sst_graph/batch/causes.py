@@ -34,6 +34,7 @@ from sst_graph.graph.state import State
 from sst_graph.initialization.candidates import StartProblem, prior_centre
 from sst_graph.initialization.selection import select_start_steps
 from sst_graph.result import CalibrationResult
+from sst_graph.sampling import step_for
 from sst_graph.stepwise import run_to_end
 from sst_graph.types import Guess
 
@@ -119,9 +120,8 @@ def fit_labels(config: CalibrationConfig) -> Fitter:
     """Search and short solution on a few scans of one drive, with a calibration's own settings."""
 
     def fit(drive: Drive, guess: Guess) -> Fit | None:
-        step = -(-len(drive.scans) // _SCANS)
         motions = motions_of([drive])
-        few = [replace(drive, scans=drive.scans[::step])]
+        few = [replace(drive, scans=drive.scans[:: step_for(len(drive.scans), _SCANS)])]
         joint = replace(config.joint, max_outer=len(NARROW_KERNELS_PX))
         search = StartProblem(few, motions, config.classes, guess)
         try:

@@ -89,7 +89,7 @@ def fuse_motion(
     config, state = problem.config, labels.solution.state
     try:
         reach_s = config.search.time_offset_s
-        guess = Guess(state.cTl, state.time_offsets_s[0])
+        guess = Guess(*state.calibration())
         motion = solve_motion(problem.drives, guess, reach_s, problem.progress)[0]
     except EstimationError as error:
         return WithMotion(labels, diagnostics={"left_out": str(error)})

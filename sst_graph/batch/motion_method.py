@@ -1,4 +1,4 @@
-"""``--method motion``: the hand-eye solution as a method of ``calibrate``, judged by edges."""
+"""``--method motion``: the hand-eye solution as a method of ``calibrate``, its fit by edges."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def motion_method(
 ) -> MethodEstimate:
     """LiDAR odometry against visual odometry; labels only leave out what may move.
 
-    The estimate uses no edges. Those of some frames, read again, judge it: its fit is theirs.
+    The estimate uses no edges. Its fit is measured by those of some frames, read again.
 
     Raises:
         EstimationError: too few consecutive frames with known motion.

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import gtsam
-
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.lower_edges import WithLowerEdges, with_lower_edges
 from sst_graph.covariance.cluster_robust import RobustCovariance, robust_covariance
@@ -29,7 +27,7 @@ from sst_graph.initialization.selection import Selection, alternatives, select_s
 from sst_graph.objects.tracks import ObjectId, object_tracks
 from sst_graph.quality.fit_of_solution import FitOfDrives
 from sst_graph.stepwise import run_to_end
-from sst_graph.types import FloatArray, Guess
+from sst_graph.types import Calibration, FloatArray, Guess
 
 
 @dataclass(frozen=True)
@@ -148,9 +146,9 @@ class MatchedDrives:
         """The same beside another start."""
         return replace(self, problem=replace(self.problem, guess=guess))
 
-    def fit_at(self, cTl: gtsam.Pose3, time_offset_s: float) -> Fit | None:
-        """The fit of a calibration with one time offset, under the same mask biases."""
-        return self.problem.fit_at(replace(self.state, cTl=cTl, time_offsets_s=(time_offset_s,)))
+    def fit_at(self, at: Calibration) -> Fit | None:
+        """The fit of a calibration, under the same mask biases."""
+        return self.problem.fit_at(replace(self.state, cTl=at.cTl, time_offsets_s=(at.time_offset_s,)))
 
 
 @dataclass(frozen=True)

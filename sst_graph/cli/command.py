@@ -33,7 +33,7 @@ def run(argv: Sequence[str], own_process: bool = False) -> int:
         return code
     except StreamError as error:
         if error.reader_gone:
-            # The reader of our output has what it wanted: there is nothing to say to it.
+            # Whoever read the output has stopped: a message would reach nobody.
             return EXIT_READER_GONE
         return _failed(str(error), EXIT_BAD_INPUT)
     except BrokenPipeError:

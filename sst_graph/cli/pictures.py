@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.cli.drive_motion import DriveMotion
+from sst_graph.cli.drive_odometry import DriveOdometry
 from sst_graph.data.frame_parts import RecentReader, image_positions, scan_positions
 from sst_graph.errors import DataError, count_of
 from sst_graph.fit import MatchedFrame
@@ -66,7 +66,7 @@ class ShownFrame:
         drive: RecentReader,
         position: int,
         result: CalibrationResult,
-        motion: DriveMotion | None = None,
+        motion: DriveOdometry | None = None,
     ) -> ShownFrame:
         """The frame at a position of the drive.
 

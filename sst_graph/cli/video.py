@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.cli.drive_motion import DriveMotion
+from sst_graph.cli.drive_odometry import DriveOdometry
 from sst_graph.cli.output_places import check_apart
 from sst_graph.cli.outputs import placement_before
 from sst_graph.cli.pictures import ShownFrame, overlay
@@ -123,7 +123,7 @@ def write_drive_video(
     def pictures() -> Iterator[NDArray[np.uint8]]:
         done = 0
         for reader, before in readers:
-            motion = DriveMotion(reader)
+            motion = DriveOdometry(reader)
             for position in scan_positions(reader.source):
                 picture = _picture(ShownFrame.of(reader, position, result, motion), result, before)
                 if picture is not None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sst_graph.types import FloatArray
 
 FEWEST = 12
-"""Fewest half-samples that a spread is believed of."""
+"""Fewest half-samples from which a spread is computed."""
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from sst_graph.features.lidar_origin import some_points
 from sst_graph.features.mask_shift import ContourProfile, contour_profiles
+from sst_graph.sampling import step_for
 from sst_graph.types import CameraImage, FloatArray, Frame, Scan, SemanticClass
 
 _SCANS, _IMAGES = 12, 12
@@ -145,7 +146,7 @@ class StatisticsCollector:
     def __init__(self, total: int) -> None:
         self._scans: list[ScanStatistics] = []
         self._images: list[ImageStatistics] = []
-        self._every_scan, self._every_image = -(-total // _SCANS), -(-total // _IMAGES)
+        self._every_scan, self._every_image = step_for(total, _SCANS), step_for(total, _IMAGES)
         self._every_cloud = max(1, total // _CLOUDS)
 
     def add(self, frame: Frame) -> None:

@@ -27,6 +27,7 @@ from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
 from sst_graph.odometry.sweep import SweepDecision, SweptSource
 from sst_graph.odometry.visual import ImagePair, next_pair
+from sst_graph.sampling import step_for
 from sst_graph.types import CameraImage, FloatArray, Frame, RelativeMotion, Scan, SemanticClass, Source
 from sst_graph.validation import checked_frame, checked_image, checked_scan
 
@@ -457,7 +458,7 @@ def _sample(scan: Scan) -> NDArray[np.intp]:
     # Compared with plain ints: compared with NumPy's, all classes are converted to int64.
     for c in np.flatnonzero(np.bincount(scan.classes[usable])).tolist():
         members = np.flatnonzero(usable & (scan.classes == c))
-        parts.append(members[:: max(1, -(-len(members) // SAMPLE_POINTS))])
+        parts.append(members[:: step_for(len(members), SAMPLE_POINTS)])
     return np.concatenate(parts)
 
 

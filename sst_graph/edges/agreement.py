@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +23,7 @@ from sst_graph.features.picture_gradients import (
 )
 from sst_graph.graph.matching import DriveEdges
 from sst_graph.graph.state import State
+from sst_graph.odometry.cloud import transformed_points
 from sst_graph.types import FloatArray, IntArray
 
 FloatMap = NDArray[np.float32]
@@ -54,11 +54,11 @@ def score_of_pairs(pairs: Sequence[tuple[int, PairedEdges]], state: State, blur_
 
 def _of_paired(paired: PairedEdges, state: State, number: int, blur_px: float) -> FloatArray:
     """(n,) share of each boundary point in view, of one drive."""
-    offset_s = state.time_offset_s(number)
-    uvs = paired.projected(paired.points.lPs, state.cTl, offset_s)
+    at = state.calibration(number)
+    uvs = paired.projected(paired.points.lPs, at)
     inside = np.flatnonzero(paired.camera.in_image(uvs))
     some, uvs = paired.take(inside), uvs[inside]
-    ways = some.projected(some.points.outward, state.cTl, offset_s) - uvs
+    ways = some.projected(some.points.outward, at) - uvs
     ways /= np.maximum(np.linalg.norm(ways, axis=1), 1e-9)[:, None]
     uvs = uvs + some.repeated(some.biases_px)[:, None] * ways
     groups = [
@@ -107,7 +107,7 @@ class BlurredScore:
         Args:
             known_fields: fields under this blur by the identity of their gradients; new ones are put there.
         """
-        cTl, time_offset_s = state.cTl, state.time_offset_s(edges.number)
+        at = state.calibration(edges.number)
         paired = edges.paired(state)
         if paired is None:
             return None
@@ -122,9 +122,9 @@ class BlurredScore:
             if id(gradients) not in known_fields:
                 known_fields[id(gradients)] = gradients.blurred(blur_px, every)
         fields = np.stack([known_fields[id(paired.contours[k])] for k in known])
-        to_lidar = cTl.inverse()
+        to_lidar = at.cTl.inverse()
         lPs, tips = (
-            _moved(to_lidar, paired.moved(each, cTl, time_offset_s))
+            transformed_points(to_lidar, paired.moved(each, at))
             for each in (paired.points.lPs, paired.points.outward)
         )
         numbers = np.array([names.get(k, -1) for k in range(len(paired.contours))])
@@ -165,7 +165,3 @@ def _gradients(paired: PairedEdges, group: int) -> PictureGradients:
     gradients = paired.contours[group]
     assert isinstance(gradients, PictureGradients)
     return gradients
-
-
-def _moved(pose: gtsam.Pose3, points: FloatArray) -> FloatArray:
-    return np.asarray(points @ pose.rotation().matrix().T + pose.translation())

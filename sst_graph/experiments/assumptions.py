@@ -170,7 +170,7 @@ def _calibrated(drive: KeptDrive, case: tuple[int, str, float], config: Assumpti
     settings = config.calibration
     result = calibrate_prepared(prepare_drives([drive], settings), drive.nominal, settings)
     assert drive.truth is not None
-    error = error_of(result.T_camera_lidar, result.time_offset_s, drive.truth)
+    error = error_of(result.calibration, drive.truth)
     report = result.diagnostics.get("assumptions", {})
     estimates = {
         name: (entry["estimate"], entry["estimate_sigma"])

@@ -108,7 +108,7 @@ def _run(drive: Mapping[str, Any], seed: int, config: ConsistencyConfig) -> Run:
     rng = np.random.default_rng([seed, 11])
     start = start_near(simulated.truth.cTl, config.start_deg, config.start_m, rng)
     result = calibrate_prepared(prepared, start, config.calibration)
-    error = error_of(result.T_camera_lidar, result.time_offset_s, simulated.truth)
+    error = error_of(result.calibration, simulated.truth)
     not_converged = result.status == "not_converged" or not result.frames_used
     return Run(error, result.covariance, not_converged, offset_observable=drive["motion"] != "standing")
 

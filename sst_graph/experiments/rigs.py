@@ -22,7 +22,7 @@ from sst_graph.rig.known import KnownPose, KnownRig
 from sst_graph.rig.marginal import RigMarginal
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
 from sst_graph.simulator.rig import beside, stereo_pose, surround, with_mounts
-from sst_graph.types import FloatArray, GroundTruth, Guess
+from sst_graph.types import Calibration, FloatArray, GroundTruth, Guess
 
 STREET: Mapping[str, Any] = {
     "motion": "stop_and_go",
@@ -138,8 +138,8 @@ def _measured(rig: Mapping[str, SimulatedDrive], seed: int) -> KnownPose:
 
 def _errors(marginal: RigMarginal, truths: Sequence[GroundTruth]) -> FloatArray:
     """(n, 7) truth less estimate of each camera, in the estimate's tangent space [rad, m, s]."""
-    estimates = zip(marginal.extrinsics, marginal.time_offsets_s, truths, strict=True)
-    return np.stack([error_of(*estimate) for estimate in estimates])
+    estimates = map(Calibration, marginal.extrinsics, marginal.time_offsets_s)
+    return np.stack([error_of(*each) for each in zip(estimates, truths, strict=True)])
 
 
 def _nees(error: FloatArray, covariance: FloatArray) -> float:

@@ -132,14 +132,13 @@ def solve_street(config: SlamConfig, weather: str, seed: int) -> Street:
     # 2. Calibration alone.
     alone = calibrate_prepared([drive], source.nominal, config.calibration)
     # 3. Both in one graph.
-    start = Calibration(alone.T_camera_lidar, alone.time_offset_s)
-    both = with_camera(graph, slam, drive, start, source.nominal, config.camera)
-    found = both.atPose3(EXTRINSIC), float(both.atVector(TIME_OFFSET)[0])
+    both = with_camera(graph, slam, drive, alone.calibration, source.nominal, config.camera)
+    found = Calibration(both.atPose3(EXTRINSIC), float(both.atVector(TIME_OFFSET)[0]))
     errors = {
         "odometry": trajectory_errors(odometry, source),
         "SLAM alone": trajectory_errors(slam, source),
-        "calibration alone": calibration_errors(start.cTl, start.time_offset_s, source),
-        "both": trajectory_errors(both, source) | calibration_errors(*found, source),
+        "calibration alone": calibration_errors(alone.calibration, source),
+        "both": trajectory_errors(both, source) | calibration_errors(found, source),
     }
     return Street(weather, len(closures), errors)
 
@@ -160,13 +159,13 @@ def trajectory_errors(values: gtsam.Values, source: SimulatedDrive) -> dict[str,
     return dict(zip(list(MEASURES)[:3], map(float, sizes), strict=True))
 
 
-def calibration_errors(cTl: gtsam.Pose3, time_offset_s: float, source: SimulatedDrive) -> dict[str, float]:
+def calibration_errors(estimate: Calibration, source: SimulatedDrive) -> dict[str, float]:
     """Sizes of the errors of extrinsic and time offset."""
-    d = source.truth.cTl.localCoordinates(cTl)
+    d = source.truth.cTl.localCoordinates(estimate.cTl)
     sizes = (
         np.degrees(np.linalg.norm(d[:3])),
         100.0 * np.linalg.norm(d[3:]),
-        1e3 * abs(time_offset_s - source.config.time_offset_s),
+        1e3 * abs(estimate.time_offset_s - source.config.time_offset_s),
     )
     return dict(zip(list(MEASURES)[3:], map(float, sizes), strict=True))
 

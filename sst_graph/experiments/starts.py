@@ -7,14 +7,13 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.data import open_source
 from sst_graph.errors import ConfigError
 from sst_graph.metrics import CalibrationErrors, calibration_errors
 from sst_graph.result import CalibrationResult
 from sst_graph.simulator import simulate
-from sst_graph.types import GroundTruth, Source
+from sst_graph.types import Calibration, FloatArray, GroundTruth, Source
 
 
 def truth_of(source: Source) -> GroundTruth:
@@ -50,6 +49,6 @@ def errors_of(result: CalibrationResult, truth: GroundTruth) -> CalibrationError
     return calibration_errors(result.T_camera_lidar, result.time_offset_s, truth, result.covariance)
 
 
-def error_of(cTl: gtsam.Pose3, time_offset_s: float, truth: GroundTruth) -> NDArray[np.float64]:
+def error_of(estimate: Calibration, truth: GroundTruth) -> FloatArray:
     """(7,) truth less estimate in the estimate's tangent space [rad, m, s]; an unknown true offset is 0."""
-    return np.append(gtsam.Pose3.Logmap(cTl.between(truth.cTl)), (truth.time_offset_s or 0.0) - time_offset_s)
+    return estimate.local_coordinates(Calibration(truth.cTl, truth.time_offset_s or 0.0))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import gtsam
 import numpy as np
 
 from sst_graph.batch import CalibrationConfig, calibrate
@@ -114,16 +113,8 @@ def spread_cells(results: Sequence[CalibrationResult]) -> list[str]:
 
 def deviations_of(results: Sequence[CalibrationResult]) -> tuple[FloatArray, list[FloatArray]]:
     """(n, 7) deviations of results from their mean weighted by information, and their covariances."""
-    first = results[0]
-    steps = np.array(
-        [
-            np.append(
-                gtsam.Pose3.Logmap(first.T_camera_lidar.between(result.T_camera_lidar)),
-                result.time_offset_s - first.time_offset_s,
-            )
-            for result in results
-        ]
-    )
+    first = results[0].calibration
+    steps = np.array([first.local_coordinates(result.calibration) for result in results])
     covariances = [np.asarray(result.covariance, np.float64) for result in results]
     information = [np.linalg.inv(C) for C in covariances]
     weighted = np.sum([H @ step for H, step in zip(information, steps, strict=True)], axis=0)

@@ -223,10 +223,10 @@ def fuse_graphs(
     parts = [marginal_of_graph(graph, values, E_key, D_key) for graph, values in graphs]
     fused = fuse_marginals(parts, significance=significance)
     for _ in range(_MOST_ROUNDS):
-        point = Calibration(fused.cTl, fused.time_offset_s)
+        point = fused.at
         parts = [marginal_of_graph(graph, values, E_key, D_key, at=point) for graph, values in graphs]
         fused = fuse_marginals(parts, significance=significance)
-        step = np.append(fused.cTl.localCoordinates(point.cTl), fused.time_offset_s - point.time_offset_s)
+        step = fused.at.local_coordinates(point)
         if np.sqrt(step @ fused.information @ step) < _CONVERGED_SIGMAS:
             return fused, parts
     raise EstimationError(
@@ -273,7 +273,7 @@ def fuse_marginals(
     fused = marginals[0]
     separate = [separated(marginal) for marginal in marginals]
     for _ in range(_MAX_ROUNDS):
-        parts = [one.carried(fused.cTl, fused.time_offset_s) for one in separate]
+        parts = [one.carried(fused.at) for one in separate]
         owns = [part.own for part in parts]
         total = CalibrationMarginal(
             fused.cTl,
@@ -284,7 +284,7 @@ def fuse_marginals(
             Common({}, tuple(sorted({one for own in owns for one in own.common.scan_hashes}))),
         )
         step = total.covariance() @ total.vector
-        fused = _carried(total, *total.best())
+        fused = _carried(total, total.best())
         if np.sqrt(max(float(step @ total.vector), 0.0)) < _STANDSTILL_SIGMAS:
             break
     else:
@@ -292,7 +292,7 @@ def fuse_marginals(
             f"fusion of {count_of(len(marginals), 'marginal')}: still moving after {_MAX_ROUNDS} rounds"
         )
     check_agreement(parts, fused.cTl, names, significance)
-    errors = weighted_steps([one.carried(fused.cTl, fused.time_offset_s) for one in separate])
+    errors = weighted_steps([one.carried(fused.at) for one in separate])
     return Separated(fused, errors).together()
 
 

@@ -61,7 +61,7 @@ class CompactObjects:
 
 
 def find_compact_objects(points: FloatArray, rings: NDArray[np.integer] | None) -> CompactObjects:
-    """Ground removed, the rest split into objects, each judged by its size.
+    """Ground removed, the rest split into objects, each classified by its size.
 
     Args:
         points: (n, 3) in the LiDAR frame [m].

@@ -23,7 +23,7 @@ _STEEPEST = 0.12
 _LOWEST_SHARE = 0.05
 """Share of a cell's points below its ground: returns by way of puddles and windows."""
 _MIN_POINTS = 4
-"""Fewest points of a cell whose lowest ones are believed."""
+"""Fewest points of a cell that counts: with fewer, the lowest may be stray."""
 _MARGIN_M = 0.2
 """Points are ground up to this height above it [m]: kerbs, and the spread of a road's returns."""
 _PLANE_ROUNDS = 4
@@ -70,8 +70,8 @@ def lowest_of_cells(points: FloatArray, cells: NDArray[np.intp] | None = None) -
     first = np.flatnonzero(np.diff(cells[order], prepend=-1))
     counts = np.diff(first, append=len(order))
     lowest = order[first + (_LOWEST_SHARE * counts).astype(np.intp)]
-    believed = counts >= _MIN_POINTS
-    return np.asarray(lowest[believed] if believed.any() else lowest)
+    enough = counts >= _MIN_POINTS
+    return np.asarray(lowest[enough] if enough.any() else lowest)
 
 
 def on_ground(heights_m: FloatArray) -> NDArray[np.bool_]:

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.sampling import step_for
 from sst_graph.types import FloatArray, SemanticClass
 
 REACH_PX = 10
@@ -115,7 +116,7 @@ def contour_profiles(
         u, v = u[usable], v[usable]
         if len(u) < _LEAST_PIXELS:
             continue
-        step = -(-len(u) // _MOST_PIXELS)
+        step = step_for(len(u), _MOST_PIXELS)
         u, v = u[::step], v[::step]
         strength = _strength(gradients, u, v, normals_x[v, u], normals_y[v, u])
         spread = float(strength.std())

@@ -18,7 +18,7 @@ _MOST_POINTS = 8_000
 _BAND_M = 0.3
 """Lowest points of cells this near to a plane lie on it [m]."""
 _SURELY = 0.5
-"""Share of the cells on a level plane that leaves no question."""
+"""Where more of the cells than this share lie on a level plane, no other plane is tried."""
 _CLEARLY = 1.5
 """Another plane is the ground where so many times as many cells lie on it as on the level one: a garage's
 ceiling has about as many as its floor."""

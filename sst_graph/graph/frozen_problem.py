@@ -453,7 +453,7 @@ def _images(matches: Sequence[DriveMatches], state: State, columns: dict[int, in
             covariances = camera_covariances(samples.covariances[pairs], state.cTl)
             information = np.asarray(np.linalg.inv(covariances), np.float64)
         keys = [twist_key(own.number, image) for image in first]
-        offsets_s = np.full(k, own.time_offset_s)
+        offsets_s = np.full(k, own.at.time_offset_s)
         parts.append(
             (keys, own.c_twists[pairs], l_twists, l_accelerations, information, np.full(k, clock), offsets_s)
         )

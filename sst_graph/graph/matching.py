@@ -42,7 +42,8 @@ from sst_graph.graph.nuisances import deviation_of, moved_twists, residual_colum
 from sst_graph.graph.state import State, lower_edge_track
 from sst_graph.objects.dynamic_objects import dynamic_object_weights
 from sst_graph.objects.tracks import numbers_in, of_each
-from sst_graph.types import FloatArray, IntArray, SemanticClass
+from sst_graph.sampling import step_for
+from sst_graph.types import Calibration, FloatArray, IntArray, SemanticClass
 
 
 @dataclass(frozen=True)
@@ -214,7 +215,7 @@ class DriveEdges:
 
     def thinned(self, most: int) -> DriveEdges:
         """Evenly spread points, at most so many."""
-        index = np.arange(0, len(self), max(1, -(-len(self) // most)))
+        index = np.arange(0, len(self), step_for(len(self), most))
         return replace(
             self,
             points=self.points.take(index),
@@ -227,7 +228,7 @@ class DriveEdges:
 
     def match(self, state: State, kernel: RobustKernel) -> DriveMatches | None:
         """Pair scans with images in true time under a state, and match their silhouettes; None without."""
-        drive, time_offset_s = self.drive, state.time_offset_s(self.number)
+        drive, calibration = self.drive, state.calibration(self.number)
         # 1. The points, and the images that they are compared with.
         at = self._at(state)
         if at is None:
@@ -238,7 +239,7 @@ class DriveEdges:
         if any(state.nuisances.values()):
             scene = at.motions.scene(drive, paired.repeated(group_pairs))
             deviation = deviation_of(state.nuisances, scene)
-        found = match_edges(paired, state.cTl, time_offset_s, kernel, self.config, deviation)
+        found = match_edges(paired, calibration, kernel, self.config, deviation)
         if len(found.index) == 0:
             return None
         if at.shares is not None and not (at.shares == 1.0).all():
@@ -252,8 +253,7 @@ class DriveEdges:
             at.groups,
             np.array(group_pairs),
             at.index.take(found.index),
-            state.cTl,
-            time_offset_s,
+            calibration,
         )
 
     def paired(self, state: State) -> PairedEdges | None:
@@ -408,7 +408,7 @@ class DriveMatches:
         groups: which of the drive's groups each is, and
         group_pairs: its pair.
         points: (m,) which of the drive's points each match is.
-        cTl, time_offset_s: extrinsic and time offset that the matches were made at.
+        at: extrinsic and time offset that the matches were made at.
     """
 
     edges: DriveEdges
@@ -418,8 +418,7 @@ class DriveMatches:
     groups: Sequence[int]
     group_pairs: IntArray
     points: IntArray
-    cTl: gtsam.Pose3
-    time_offset_s: float
+    at: Calibration
 
     def __len__(self) -> int:
         return len(self.points)
@@ -500,7 +499,7 @@ class DriveMatches:
             return {}
         pair = self.pair_of
         base_taus_s = np.array([each.base_tau_s for each in self.pairs])[pair]
-        at = self.cTl, self.time_offset_s, self.c_twists[pair].T
+        at = self.at.cTl, self.at.time_offset_s, self.c_twists[pair].T
         scene = self.motions.scene(self.edges.drive, pair)
         return residual_columns(self.alignment, scene, base_taus_s, at, names)
 

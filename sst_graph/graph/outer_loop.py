@@ -231,7 +231,7 @@ def solve_joint_steps(
         share = step_share(at_last)
         state = state.towards(frozen.state_at(optimum), share)
         count = sum(map(len, matches))
-        iterations.append(OuterIteration(scale, count, state.cTl, state.time_offsets_s[0]))
+        iterations.append(OuterIteration(**vars(state.calibration()), kernel_px=scale, matches=count))
         if progress is not None:
             progress("solve", outer + 1, config.max_outer)
         yield 1 + pairs // _PAIRS_A_UNIT

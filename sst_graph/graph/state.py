@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from sst_graph.assumptions import ASSUMPTIONS
-from sst_graph.types import FloatArray, SemanticClass
+from sst_graph.types import Calibration, FloatArray, SemanticClass
 
 EXTRINSIC = gtsam.symbol("E", 0)
 """Key of the extrinsic cTl (Pose3)."""
@@ -76,6 +76,10 @@ class State:
         """Time offset of a drive [s]."""
         return self.time_offsets_s[self.clock(drive)]
 
+    def calibration(self, drive: int = 0) -> Calibration:
+        """Extrinsic and time offset of a drive."""
+        return Calibration(self.cTl, self.time_offset_s(drive))
+
     def object_bias_px(self, drive: int, track: int, semantic_class: SemanticClass) -> float:
         """Mask bias of one object [px]."""
         of_class = self.biases_px.get((drive, semantic_class), 0.0)
@@ -112,7 +116,7 @@ class State:
 def difference(a: State, b: State) -> FloatArray:
     """(7,) step from one state to another, of extrinsic and first time offset, in the tangent space of the
     covariance."""
-    return np.append(gtsam.Pose3.Logmap(a.cTl.between(b.cTl)), b.time_offsets_s[0] - a.time_offsets_s[0])
+    return a.calibration().local_coordinates(b.calibration())
 
 
 def step_text(step: FloatArray) -> str:

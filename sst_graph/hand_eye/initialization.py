@@ -10,6 +10,7 @@ import numpy as np
 
 from sst_graph.drive.path import SensorPath
 from sst_graph.hand_eye.graph import CameraStep, MotionPairs, pair_motions
+from sst_graph.sampling import spread_places
 from sst_graph.types import FloatArray, Guess
 
 LEAST_SHARE = 0.4
@@ -55,8 +56,7 @@ def motion_starts(
     Args:
         max_offset_s: half width of the time offsets that are tried around the guess [s].
     """
-    chosen = np.unique(np.linspace(0, len(steps) - 1, min(_MAX_PAIRS, len(steps))).astype(int))
-    some = [steps[i] for i in chosen] if steps else []
+    some = [steps[i] for i in spread_places(np.arange(len(steps)), _MAX_PAIRS)]
     count = int(np.ceil(max_offset_s / _STEP_S))
     grid = guess.time_offset_s + _STEP_S * np.arange(-count, count + 1)
     found: list[MotionStart | None] = []

@@ -84,7 +84,7 @@ class MotionSolution:
 
     @property
     def misfit(self) -> str | None:
-        """Why the covariance is not to be believed; None where the odometry fits."""
+        """Why the covariance may be wrong; None where the odometry fits."""
         worst = max(self.scales.rotation, self.scales.direction)
         if worst <= MAX_NOISE_SCALE:
             return None
@@ -195,7 +195,7 @@ def _solve(
         # alternate; stop when the step is small.
         step = step_share(outer) * difference(state, moved)
         state = state.moved(step)
-        iterations.append(OuterIteration(None, len(pairs), state.cTl, state.time_offsets_s[0]))
+        iterations.append(OuterIteration(**vars(state.calibration()), kernel_px=None, matches=len(pairs)))
         converged = float(step @ np.linalg.solve(covariance, step)) < STEP_SIGMAS**2
     misfit = len(terms) * (3.0 * np.log(scales.rotation) + 2.0 * np.log(scales.direction))
     cost = float(misfit)

@@ -70,7 +70,7 @@ def candidate_steps(problem: StartProblem, config: SearchConfig) -> Stepwise[lis
     if not config.enabled:
         if problem.guess.cTl is None:
             raise EstimationError("no guess to start from, and the search is switched off")
-        return [Candidate(problem.guess.cTl, problem.guess.time_offset_s, 0.0)]
+        return [Candidate(problem.guess.cTl, problem.guess.time_offset_s)]
     frames, camera = _richest_frames(problem, FRAMES)
     search = SearchProblem(frames, camera, problem.classes, problem.guess, config)
     candidates = yield from search_steps(search, COARSE)

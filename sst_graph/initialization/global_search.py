@@ -26,7 +26,7 @@ from sst_graph.initialization.label_agreement import (
     States,
 )
 from sst_graph.stepwise import Stepwise
-from sst_graph.types import FloatArray, Guess, IntArray, SemanticClass
+from sst_graph.types import Calibration, FloatArray, Guess, IntArray, SemanticClass
 
 _GRID_STEP = np.radians(7.5)
 """Spacing of the rotation grid over all of SO(3), about half the widest blur's reach [rad]; the cost grows
@@ -123,13 +123,11 @@ FINE = (
 """Stages up to the optimum of the label agreement itself."""
 
 
-@dataclass(frozen=True)
-class Candidate:
-    """A pose and time offset with its score per cell of the images (0 chance, higher better)."""
+@dataclass(frozen=True, eq=False)
+class Candidate(Calibration):
+    """A calibration with its score per cell of the images (0 chance, higher better)."""
 
-    cTl: gtsam.Pose3
-    time_offset_s: float
-    score: float
+    score: float = 0.0
 
 
 @dataclass(frozen=True)

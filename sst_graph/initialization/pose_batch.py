@@ -3,9 +3,10 @@
 Matches are those of :func:`~sst_graph.association.edge_matching.match_edges`, made by the same rules. The
 differences are for speed, because the search matches some hundred poses where the graph matches one: points
 that are far out of view are sorted out first; motion is of second order in the interval; the contours'
-distances and normals come from one bilinear cell; objects are taken as static, points as measured. The
-unknowns are pose, time offset and one mask bias a class; twists are fixed, and so a step costs a hundredth of
-that of :class:`~sst_graph.graph.frozen_problem.FrozenProblem`, which gives the estimate itself.
+distances and normals come from one bilinear cell; objects are taken as static, points as measured; pixels
+that rectification enlarged count like others, and level edges share no error along a ring. The unknowns are
+pose, time offset and one mask bias a class; twists are fixed, and so a step costs a hundredth of that of
+:class:`~sst_graph.graph.frozen_problem.FrozenProblem`, which gives the estimate itself.
 """
 
 from __future__ import annotations

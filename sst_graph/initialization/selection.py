@@ -102,17 +102,17 @@ def select_start_steps(
     """
     candidates = yield from candidate_steps(problem, config)
     if not config.enabled:
-        start = (Calibration(candidates[0].cTl, candidates[0].time_offset_s),)
+        start = (Calibration(*candidates[0]),)
         return Selection(start, start, candidates[0].score)
     candidates = candidates[: _CANDIDATES_WITHOUT_GUESS if problem.guess.cTl is None else most_candidates]
     selection = yield from select_among_steps(problem, candidates, graph, config, most_scans)
     if problem.guess.cTl is not None:
         return selection
     closer = []
-    for cTl, time_offset_s in selection.distant:
-        guess = replace(problem.guess, cTl=cTl)
+    for distant in selection.distant:
+        guess = replace(problem.guess, cTl=distant.cTl)
         around = yield from candidate_steps(replace(problem, guess=guess), config)
-        closer += [Candidate(cTl, time_offset_s, selection.score), *around[:most_candidates]]
+        closer += [Candidate(**vars(distant), score=selection.score), *around[:most_candidates]]
     return (yield from select_among_steps(problem, closer, graph, config, most_scans))
 
 

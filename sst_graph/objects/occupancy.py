@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sst_graph.drive.preparation import ScanFeatures
+from sst_graph.odometry.cloud import transformed_points
 from sst_graph.odometry.lidar import GROUND_CLASSES, TESTED_CLASSES
+from sst_graph.sampling import step_for
 from sst_graph.types import FloatArray, SemanticClass
 
 ObjectName = tuple[SemanticClass, int]
@@ -151,17 +153,17 @@ class _Places:
             names += [(c, int(n)) for n in np.unique(objects)]
             chosen = _some_of_each(objects, _MAX_POINTS)
             reaches = np.maximum(_REACH_M, _REACH_RATIO * np.linalg.norm(lPs[chosen], axis=1))
-            outlines[c] = _Outlines(_moved(wTl, lPs[chosen]), reaches, objects[chosen])
+            outlines[c] = _Outlines(transformed_points(wTl, lPs[chosen]), reaches, objects[chosen])
             inside = scan.lPs[scan.classes == c]
             thin = inside[:: max(1, len(inside) // _MAX_INSIDE)]
-            trees[c] = _tree(_moved(wTl, np.concatenate([lPs, thin])))
+            trees[c] = _tree(transformed_points(wTl, np.concatenate([lPs, thin])))
         return cls(scan.stamp_ns, tuple(names), outlines, trees, scan, wTl)
 
     @cached_property
     def _anything(self) -> cKDTree | None:
         """All points but the ground's in the world; built when needed."""
         raised = self.scan.lPs[_RAISED[self.scan.classes]]
-        return _tree(_moved(self.wTl, raised)) if len(raised) else None
+        return _tree(transformed_points(self.wTl, raised)) if len(raised) else None
 
     def found_in(self, other: _Places) -> dict[ObjectName, float]:
         """Share of each object's points whose place is occupied in another scan, by its class or anything."""
@@ -197,17 +199,12 @@ class _Outlines:
 
 
 def _tree(wPs: FloatArray) -> cKDTree:
-    """Points (n, 3) to look among: for few queries, so it is built without care for its shape."""
+    """A tree of points (n, 3); for few queries it is not balanced, which takes longer than they do."""
     return cKDTree(wPs, balanced_tree=False, compact_nodes=False)
-
-
-def _moved(wTl: gtsam.Pose3, lPs: FloatArray) -> FloatArray:
-    """Points (n, 3) in the world [m]."""
-    return np.asarray(lPs @ wTl.rotation().matrix().T + wTl.translation())
 
 
 def _some_of_each(objects: NDArray[np.intp], most: int) -> NDArray[np.intp]:
     """Positions of at most ``most`` evenly spread entries of each number."""
     order = np.argsort(objects, kind="stable")
     parts = np.split(order, np.flatnonzero(np.diff(objects[order])) + 1)
-    return np.concatenate([part[:: -(-len(part) // most)] for part in parts if len(part)])
+    return np.concatenate([part[:: step_for(len(part), most)] for part in parts if len(part)])

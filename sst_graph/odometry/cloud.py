@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import gtsam
 import numpy as np
 import small_gicp
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
+from sst_graph.factors.motion import cross_rows
+from sst_graph.sampling import spread_places
 from sst_graph.types import FloatArray, Scan
 
 PARALLEL_COSINE = 0.9
@@ -26,20 +29,23 @@ def compensate_sweep(points: FloatArray, offsets_s: FloatArray, twist: FloatArra
         truncation is 2e-5 of the range.
     """
     omega, v = twist[:3], twist[3:]
-    rate = _turned(omega, points) + v
+    rate = cross_rows(omega, points) + v
     t = offsets_s[:, None]
-    return np.asarray(points + t * (rate + 0.5 * t * _turned(omega, rate)))
-
-
-def _turned(omega: FloatArray, points: FloatArray) -> FloatArray:
-    """(n, 3) omega x points; several times faster than ``np.cross``."""
-    a, b, c = omega
-    x, y, z = points.T
-    return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=1)
+    return np.asarray(points + t * (rate + 0.5 * t * cross_rows(omega, rate)))
 
 
 FEWEST_POINTS = 11
 """That small_gicp registers without a warning of its own on stderr."""
+
+
+def transformed_points(aTb: gtsam.Pose3, bPs: FloatArray) -> FloatArray:
+    """(n, 3) points of frame b in frame a; ``transformFrom`` flattens a batch of one."""
+    return np.asarray(bPs @ aTb.rotation().matrix().T + aTb.translation())
+
+
+def transformed_by(aTb: FloatArray, bPs: FloatArray) -> FloatArray:
+    """:func:`transformed_points` by a (4, 4) matrix."""
+    return np.asarray(bPs @ aTb[:3, :3].T + aTb[:3, 3])
 
 
 def usable_points(
@@ -52,8 +58,7 @@ def usable_points(
     """
     square = np.einsum("ij,ij->i", scan.points, scan.points)
     kept = np.flatnonzero((square > near_m**2) & (square < far_m**2))  # NaN and inf compare as False
-    if len(kept) > most:
-        kept = kept[np.linspace(0, len(kept) - 1, most).astype(np.intp)]
+    kept = spread_places(kept, most)
     offsets = None if scan.offsets_s is None else scan.offsets_s[kept].astype(np.float64)
     return scan.points.take(kept, axis=0).astype(np.float64), scan.classes[kept], offsets
 
@@ -81,7 +86,7 @@ def registration_cloud(
     allowed = max(int(plane_ratio * (len(lPs) - len(members))), 10 * neighbours)
     if len(members) > allowed:
         kept = ~parallel
-        kept[members[np.linspace(0, len(members) - 1, allowed).astype(np.intp)]] = True
+        kept[spread_places(members, allowed)] = True
         lPs = lPs[kept]
     return surfaces(lPs, neighbours)
 

@@ -19,6 +19,7 @@ from sst_graph.odometry.cloud import (
     compensate_sweep,
     registration_cloud,
     surfaces,
+    transformed_by,
     usable_points,
 )
 from sst_graph.odometry.local_map import LocalMap, MappedCloud
@@ -166,7 +167,7 @@ class LidarOdometry:
         for _ in range(_COMPENSATIONS):
             points, others = static.at_stamp(twist), movable.at_stamp(twist)
             # Static objects of movable classes (parked cars) help where there is little else.
-            parked = self._static.find(_transformed(wTl, others), scan.stamp_ns)
+            parked = self._static.find(transformed_by(wTl, others), scan.stamp_ns)
             found = self._align(np.concatenate([points, others[parked]]), wTl, seconds)
             if found is None or scan.offsets_s is None or not scan.offsets_s.any():
                 return found
@@ -268,7 +269,7 @@ class LidarOdometry:
     def _after_registration(self, scan: Scan, registered: int) -> None:
         """Keep the movable objects for later comparison, and adapt the voxels to the number registered."""
         movable = self._parts(scan)[1].at_stamp(self._twist)
-        self._static.insert(_transformed(self._wTl, movable), scan.stamp_ns)
+        self._static.insert(transformed_by(self._wTl, movable), scan.stamp_ns)
         edge = self._voxel_m * np.sqrt(registered / _TARGET_POINTS)
         self._voxel_m = float(np.clip(edge, _MIN_VOXEL_M, _MAX_VOXEL_M))
 
@@ -385,11 +386,6 @@ def _exp(twist: FloatArray | None, seconds: float) -> FloatArray:
 def _log(matrix: FloatArray) -> FloatArray:
     """(6,) logarithm [rot, trans] of a (4, 4) motion."""
     return np.asarray(gtsam.Pose3.Logmap(gtsam.Pose3(matrix)))
-
-
-def _transformed(wTl: FloatArray, lPs: FloatArray) -> FloatArray:
-    """(n, 3) points lPs (n, 3) in the frame to which the (4, 4) pose leads."""
-    return np.asarray(lPs @ wTl[:3, :3].T + wTl[:3, 3])
 
 
 def orthonormal(matrix: FloatArray) -> FloatArray:

@@ -17,6 +17,7 @@ from sst_graph.graph.state import State
 from sst_graph.objects.tracks import ObjectId
 from sst_graph.quality.close_points import attainable_share, close_share
 from sst_graph.quality.residuals import Measured, measure_points
+from sst_graph.sampling import step_for
 from sst_graph.types import SemanticClass
 
 _POINTS_OF_SHARE = 10_000
@@ -101,7 +102,7 @@ class FitOfDrives:
             return None
         others = turned_states(state, self.seed)[:_TURNED] if self.by_edges else ()
         quality, points = self.quality(measured, start, others), measured.points
-        every = -(-len(points) // MOST_POINTS)
+        every = step_for(len(points), MOST_POINTS)
         return Fit(
             measured.frames,
             points.take(slice(None, None, every)),

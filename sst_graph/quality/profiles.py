@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import gtsam
 import numpy as np
 
 from sst_graph.association.edge_matching import PairedEdges
@@ -15,7 +14,7 @@ from sst_graph.fit import Profile
 from sst_graph.graph.frozen_problem import FrozenPoint, FrozenProblem
 from sst_graph.graph.matching import DriveEdges
 from sst_graph.graph.state import State
-from sst_graph.types import FloatArray
+from sst_graph.types import Calibration, FloatArray
 
 _STEPS = (1.0, 2.0, 3.0, 4.0)
 """How far a profile goes to either side, in standard deviations."""
@@ -54,7 +53,7 @@ def profiles(
         for sign in (-1.0, 1.0):
             for count in counts:
                 step = sign * count * unit
-                # The answer of the rest by the linear problem, then once more where that leads.
+                # The other unknowns follow by one linear step, then by a second one from there.
                 point = frozen.moved(optimum, *system.step_along(unknown, step))
                 point = frozen.moved(point, *frozen.linearized(point).step_along(unknown, 0.0))
                 steps.append(step)
@@ -80,7 +79,7 @@ def score_profiles(
     """
     some = [own.thinned(_SCORE_POINTS) for own in edges]
     pairs = [
-        (own.number, _near_view(paired, state.cTl, state.time_offset_s(own.number)))
+        (own.number, _near_view(paired, state.calibration(own.number)))
         for own in some
         if (paired := own.paired(state)) is not None
     ]
@@ -117,9 +116,9 @@ def _with_motion_in(other: FloatArray, paired: PairedEdges) -> PairedEdges:
     return replace(paired, motion=CameraTwist(motion.c_twist @ other.T, motion.c_acceleration @ other.T))
 
 
-def _near_view(paired: PairedEdges, cTl: gtsam.Pose3, time_offset_s: float) -> PairedEdges:
+def _near_view(paired: PairedEdges, at: Calibration) -> PairedEdges:
     """The points that are in the picture, or may come into it."""
-    camera, uvs = paired.camera, paired.projected(paired.points.lPs, cTl, time_offset_s)
+    camera, uvs = paired.camera, paired.projected(paired.points.lPs, at)
     size = np.array([camera.width, camera.height])
     near = ((uvs > -_BESIDE_PX) & (uvs < size + _BESIDE_PX)).all(axis=1)
     return paired.take(np.flatnonzero(near))

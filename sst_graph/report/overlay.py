@@ -14,6 +14,7 @@ from sst_graph.features.mask_contour import ContourMap
 from sst_graph.fit import PointResiduals
 from sst_graph.report.drawn_frame import DrawnFrame
 from sst_graph.report.html import jpeg, packed, text
+from sst_graph.sampling import step_for
 from sst_graph.types import Calibration, FloatArray, SemanticClass
 
 _MOST_WIDTH = 1600
@@ -101,7 +102,7 @@ def _cloud(drawn: DrawnFrame, placements: Placements) -> list[FloatArray]:
     after, depths = drawn.projected(*placements.after)
     before = after if placements.before is None else drawn.projected(*placements.before)[0]
     seen = np.flatnonzero(drawn.camera.in_image(after) | drawn.camera.in_image(before))
-    seen = seen[:: max(1, -(-len(seen) // _MOST_POINTS))]
+    seen = seen[:: step_for(len(seen), _MOST_POINTS)]
     seen = seen[np.argsort(-depths[seen])]
     none = np.full(len(seen), np.nan)
     classes = drawn.scan.classes[seen].astype(np.float64)

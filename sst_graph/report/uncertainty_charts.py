@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import gtsam
 import numpy as np
 
 from sst_graph.fit import Fit, Profile
@@ -28,12 +27,7 @@ def convergence_chart(fit: Fit, result: CalibrationResult) -> str:
     if len(iterations) < 2:
         return ""
     last, sigmas = iterations[-1], np.sqrt(np.diag(result.covariance))
-    steps = np.array(
-        [
-            [*gtsam.Pose3.Logmap(last.cTl.between(one.cTl)), one.time_offset_s - last.time_offset_s]
-            for one in iterations
-        ]
-    )
+    steps = np.array([last.local_coordinates(one) for one in iterations])
     parts = np.abs(steps) / np.maximum(sigmas, 1e-12)
     curves = (
         ("rotation", parts[:, :3].max(axis=1), "a"),
@@ -69,7 +63,7 @@ def profile_charts(profiles: Sequence[Profile], result: CalibrationResult) -> li
 
 def _profile(profile: Profile, sigma: float) -> str:
     unit, scale = UNITS[profile.unknown], float(HUMAN[profile.unknown])
-    # The cost counts matches as independent; the covariance knows better. Both get the same width.
+    # The cost counts matches as independent, the covariance does not: the cost is scaled to its width.
     tempered = profile.costs * (profile.sigma / sigma) ** 2
     x = np.linspace(profile.steps[0], profile.steps[-1], 81)
     chart = Chart(

@@ -47,7 +47,7 @@ from sst_graph.rig.joint_covariance import JointCovariance, joint_covariance
 from sst_graph.rig.known import KnownRig
 from sst_graph.rig.marginal import RigMarginal
 from sst_graph.rig.result import RigResult, worst
-from sst_graph.types import FloatArray, Guess, Source
+from sst_graph.types import Calibration, FloatArray, Guess, Source
 from sst_graph.validation import checked_guess
 
 CameraSources = Source | Sequence[Source]
@@ -227,16 +227,16 @@ class _Camera:
             return float(self.errors.estimated) if isinstance(self.errors, SharedErrors) else 1.0
         return outcome.estimate.robust.table.clusters
 
-    def fit_at(self, cTl: gtsam.Pose3, time_offset_s: float) -> Fit | None:
+    def fit_at(self, at: Calibration) -> Fit | None:
         """How a calibration fits its labels or edges: its own estimate, or one that the rig has moved."""
-        own = self.result
-        if own.fit is not None and own.time_offset_s == time_offset_s and own.T_camera_lidar.equals(cTl, 0.0):
-            return own.fit
+        own, fit = self.result.calibration, self.result.fit
+        if fit is not None and own.time_offset_s == at.time_offset_s and own.cTl.equals(at.cTl, 0.0):
+            return fit
         if self.estimate is not None and self.estimate.matched is not None:
-            return self.estimate.matched.fit_at(cTl, time_offset_s)
+            return self.estimate.matched.fit_at(at)
         by_edges = has_edges(self.problem.drives)
         problem = with_fewer_points(self.problem) if by_edges else self.problem
-        return problem.fit_at(State(cTl, (time_offset_s,)))
+        return problem.fit_at(State(at.cTl, (at.time_offset_s,)))
 
 
 def _solved(problem: CalibrationProblem, start: Guess | None = None) -> _Camera:
@@ -462,7 +462,7 @@ def _camera_result(
         "covariance": own.covariance.tolist(),
         "status": own.status,
     }
-    fit = camera.fit_at(cTl, after.time_offsets_s[at])
+    fit = camera.fit_at(Calibration(cTl, after.time_offsets_s[at]))
     diagnostics = {key: value for key, value in own.diagnostics.items() if key != QUALITY}
     return replace(
         own,

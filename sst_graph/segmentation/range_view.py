@@ -124,7 +124,7 @@ class RangeImage:
         down, right = np.mgrid[: neighbours.window, : neighbours.window].reshape(2, -1)
         rows, columns = self.rows[:, None] + down, self.columns[:, None] + right
         around = ranges[rows, columns]
-        around[:, len(down) // 2] = self.ranges  # the point itself, who or whatever has its pixel
+        around[:, len(down) // 2] = self.ranges  # the point itself, also where another has its pixel
         far = np.abs(around - self.ranges[:, None]) * _nearness(neighbours)
         count = min(neighbours.count, far.shape[1])
         nearest = np.argpartition(far, count - 1, axis=1)[:, :count]

@@ -137,7 +137,7 @@ class LabelStore:
         ids = cityscapes_ids_of(labels.mask)
         if labels.instances is not None:
             numbered = np.where(labels.instances > 0, ids.astype(np.uint16) * 256 + labels.instances, 0)
-            # First: where the mask is, all is.
+            # Before the mask: where that is found, nothing is missing.
             atomic_write_bytes(_instances_path(path), _png(numbered.astype(np.uint16)))
         atomic_write_bytes(path, _png(ids))
 

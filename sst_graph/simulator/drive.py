@@ -50,7 +50,7 @@ class RawFrame:
     Attributes:
         points: (n, 3) float32 [m]; offsets_s (n,) float32 [s]; rings (n,) uint16 from the top.
         point_kinds, point_instances: (n,) labels of the points.
-        pixels: (h, w, 3) uint8; pixel_kinds, pixel_instances: (h, w) labels of the pixels.
+        pixels: (h, w, 3) uint8; pixel_kinds (h, w) uint8.
     """
 
     points: NDArray[np.float32]
@@ -60,7 +60,6 @@ class RawFrame:
     point_instances: NDArray[np.uint16]
     pixels: NDArray[np.uint8]
     pixel_kinds: NDArray[np.uint8]
-    pixel_instances: NDArray[np.uint16]
 
 
 @dataclass(frozen=True)
@@ -152,8 +151,8 @@ class SimulatedDrive:
         """The frame in the simulator's own kinds."""
         index = self._checked(position)
         points, offsets, rings, kinds, instances = self._scan(index)
-        pixels, pixel_kinds, pixel_instances = self._image(index)
-        return RawFrame(points, offsets, rings, kinds, instances, pixels, pixel_kinds, pixel_instances)
+        pixels, pixel_kinds, _ = self._image(index)
+        return RawFrame(points, offsets, rings, kinds, instances, pixels, pixel_kinds)
 
     def wTl(self, lidar_time_s: float) -> gtsam.Pose3:
         """True pose of the LiDAR in the world at a LiDAR time [s]."""

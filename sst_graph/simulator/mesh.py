@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.factors.motion import cross_rows
 from sst_graph.simulator.surfaces import Kind, Material
 from sst_graph.types import FloatArray
 
@@ -70,7 +71,7 @@ def yaw_rotation(yaw: float) -> FloatArray:
 
 def normals_of(triangles: FloatArray) -> FloatArray:
     """(n, 3) outward unit normals of triangles (n, 3, 3)."""
-    normals = _cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normals = cross_rows(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     return np.asarray(normals / np.maximum(np.sqrt((normals**2).sum(axis=1, keepdims=True)), 1e-12))
 
 
@@ -84,14 +85,6 @@ def _turned(points: FloatArray, rotation: FloatArray) -> FloatArray:
     return np.asarray(points.reshape(-1, 3) @ rotation.T).reshape(points.shape)
 
 
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """(n, 3) cross products of the rows of a and b (n, 3)."""
-    (ax, ay, az), (bx, by, bz) = a.T, b.T
-    product = np.empty_like(a)
-    product[:, 0], product[:, 1], product[:, 2] = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-    return product
-
-
 def planar_textures(triangles: FloatArray) -> FloatArray:
     """(n, 2, 4) texture frames in each face's plane: along the horizontal and up the slope."""
     normals = normals_of(triangles)
@@ -101,7 +94,7 @@ def planar_textures(triangles: FloatArray) -> FloatArray:
     flat = size[:, 0] < 0.3
     along /= np.maximum(size, 1e-12)
     along[flat] = (1.0, 0.0, 0.0)
-    up = _cross(normals, along)
+    up = cross_rows(normals, along)
     up[flat] = (0.0, 1.0, 0.0)
     textures = np.zeros((len(triangles), 2, 4))
     textures[:, 0, :3], textures[:, 1, :3] = along, up
@@ -184,9 +177,9 @@ def cylinder_triangles(
     """Triangles of a (conical) cylinder between two axis points with ``sides`` faces around [m]."""
     axis = (end - start) / np.linalg.norm(end - start)
     helper = np.array([0.0, 0.0, 1.0]) if abs(axis[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
-    (first,) = _cross(helper[None], axis[None])
+    (first,) = cross_rows(helper[None], axis[None])
     first /= np.linalg.norm(first)
-    (second,) = _cross(axis[None], first[None])
+    (second,) = cross_rows(axis[None], first[None])
     angles = 2 * np.pi * np.arange(sides) / sides
     circle = np.cos(angles)[:, None] * first + np.sin(angles)[:, None] * second
     return loft_triangles(np.stack([start + radii[0] * circle, end + radii[1] * circle]))

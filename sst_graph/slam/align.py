@@ -40,7 +40,7 @@ from sst_graph.factors.robust import RobustKernel
 from sst_graph.features.lidar_edges import Boundaries, with_points
 from sst_graph.objects.occupancy import ObjectName
 from sst_graph.objects.velocity import velocities_of_points
-from sst_graph.types import CameraImage, FloatArray, Scan, SemanticClass
+from sst_graph.types import Calibration, CameraImage, FloatArray, Scan, SemanticClass
 from sst_graph.validation import checked_image, checked_scan, checked_stamp
 
 VEHICLES = (SemanticClass.VEHICLE,)
@@ -242,7 +242,7 @@ def align_frame(
     points, contours = features_of(scan, image, matching.classes, calibration.camera)
     from_ns = points.stamp_ns if motion.from_ns is None else motion.from_ns
     place = calibration.cTl if motion.lTs is None else calibration.cTl * motion.lTs
-    offset_s, biases_px = calibration.time_offset_s, calibration.biases_px
+    at = Calibration(place, calibration.time_offset_s)
     found: dict[SemanticClass, SilhouetteMatches] = {}
     for classes, kernel, config in matching.matchers():
         boundaries = {c: some for c, some in points.boundaries.items() if c in classes}
@@ -255,7 +255,7 @@ def align_frame(
             motion.of_camera(calibration.cTl),
             velocities,
         )
-        found |= match_silhouettes(pair, place, offset_s, biases_px, kernel, config)
+        found |= match_silhouettes(pair, at, calibration.biases_px, kernel, config)
     return FrameAlignments(
         tuple(found),
         tuple(matches.alignment for matches in found.values()),

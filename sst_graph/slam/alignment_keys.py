@@ -22,7 +22,7 @@ from sst_graph.factors.custom.variables import (
     number_or_key,
     pose_or_key,
 )
-from sst_graph.types import FloatArray, SemanticClass
+from sst_graph.types import Calibration, FloatArray, SemanticClass
 from sst_graph.validation import checked_stamp
 
 _CLASSES = tuple(SemanticClass)
@@ -206,6 +206,10 @@ class AlignmentKeys:
 
     def offset(self, values: gtsam.Values) -> float:
         return number(values, self.time_offset_s, "time_offset_s")
+
+    def calibration(self, values: gtsam.Values) -> Calibration:
+        """Extrinsic and time offset in the values."""
+        return Calibration(self.extrinsic(values), self.offset(values))
 
     def bias(self, values: gtsam.Values, semantic_class: SemanticClass) -> float:
         return number(values, self.biases_px.get(semantic_class, 0.0), "biases_px")

@@ -379,7 +379,7 @@ class AlignmentTerm:
         place = matches.place
         if place is None:
             return []
-        cTl, time_offset_s = self.keys.extrinsic(values), self.keys.offset(values)
+        cTl, time_offset_s = self.keys.calibration(values)
         between = place.between
         a, b = body_pose(values, between.X_a), body_pose(values, between.X_b)
         c_twist = cTl.AdjointMap() @ self._in_lidar(

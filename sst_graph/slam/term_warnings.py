@@ -132,10 +132,7 @@ def far_linearization(
 
 def _step(keys: AlignmentKeys, start: gtsam.Values, values: gtsam.Values) -> FloatArray:
     """(7,) of extrinsic and offset from one estimate to another [rad, m, s]."""
-    return np.append(
-        gtsam.Pose3.Logmap(keys.extrinsic(start).between(keys.extrinsic(values))),
-        keys.offset(values) - keys.offset(start),
-    )
+    return keys.calibration(start).local_coordinates(keys.calibration(values))
 
 
 def last_warnings(

@@ -3,36 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
-import gtsam
 import numpy as np
 
 from sst_graph.graph.linear import scaled_inverse
 from sst_graph.tracker.window.epochs import RetiredEpoch
 from sst_graph.tracker.window.gaussian import Gaussian, Point
 from sst_graph.tracker.window.smoother import WindowSmoother
-from sst_graph.types import FloatArray
+from sst_graph.types import Calibration, FloatArray
 
 MAX_EPOCHS = 5000
 """Epochs kept for smoothing: nearly an hour and a half, at some kilobytes each."""
 
 
-@dataclass(frozen=True)
-class HistoryEntry:
-    """One epoch.
+@dataclass(frozen=True, eq=False)
+class HistoryEntry(Calibration):
+    """The smoothed calibration of one epoch.
 
     Attributes:
         stamp_ns: its first scan's stamp.
-        cTl, time_offset_s: the smoothed calibration.
         covariance: (7, 7), cluster-robust epoch by epoch.
     """
 
-    stamp_ns: int
-    cTl: gtsam.Pose3
-    time_offset_s: float
-    covariance: FloatArray
+    stamp_ns: int = field(kw_only=True)
+    covariance: FloatArray = field(kw_only=True)
 
 
 def smoothed_epochs(past: Iterable[RetiredEpoch], smoother: WindowSmoother) -> list[HistoryEntry]:
@@ -49,7 +45,9 @@ def smoothed_epochs(past: Iterable[RetiredEpoch], smoother: WindowSmoother) -> l
         total = own.plus(a).plus(b)
         best = total.mean()
         covariance = scaled_inverse(total.information)[:7, :7]
-        entries.append(HistoryEntry(epoch.start_ns, best.cTl, best.time_offset_s, covariance))
+        entries.append(
+            HistoryEntry(best.cTl, best.time_offset_s, stamp_ns=epoch.start_ns, covariance=covariance)
+        )
     return entries
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from sst_graph.batch.method_estimate import UNKNOWN_SIGMAS
 from sst_graph.covariance.observability import open_directions
 from sst_graph.result import WeakDirection
-from sst_graph.types import ByValue, FloatArray
+from sst_graph.types import ByValue, Calibration, FloatArray
 
 if TYPE_CHECKING:
     from sst_graph.tracker.tracker import Tracker
@@ -80,6 +80,11 @@ class TrackUpdate(ByValue):
     frame: int | None = None
     estimated: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     undecided_sweep: str = ""
+
+    @property
+    def calibration(self) -> Calibration:
+        """``T_camera_lidar`` and ``time_offset_s`` as one."""
+        return Calibration(self.T_camera_lidar, self.time_offset_s)
 
     @property
     def sigmas(self) -> FloatArray:

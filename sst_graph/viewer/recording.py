@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from sst_graph.errors import ConfigError, optional_module
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.inspect.inspection import HUMAN
+from sst_graph.sampling import step_for
 from sst_graph.tracker.track_update import TrackUpdate
 from sst_graph.types import Calibration, FloatArray, SemanticClass
 from sst_graph.viewer.frame_view import FrameView, MatchView
@@ -115,7 +116,7 @@ class Recording:
         self._at(view.number, scan.stamp_ns)
         self._log(LIDAR, _transform(rr, view.oTl))
         self._log(CAMERA, _transform(rr, view.cTl.inverse()))
-        every = max(1, -(-len(scan.points) // _MOST_POINTS))
+        every = step_for(len(scan.points), _MOST_POINTS)
         self._log(f"{LIDAR}/cloud", rr.Points3D(scan.points[::every], class_ids=scan.classes[::every]))
         self._path.append(np.asarray(view.oTl.translation()))
         self._log("world/trajectory", rr.LineStrips3D([np.array(self._path)], colors=[(255, 200, 0)]))
@@ -139,9 +140,9 @@ class Recording:
         if update.frame is not None:
             self._at(update.frame, update.stamp_ns)
         if self._reference is None:
-            self._reference = Calibration(update.T_camera_lidar, update.time_offset_s)
+            self._reference = update.calibration
         if update.covariance is not None:
-            self.estimate(update.T_camera_lidar, update.time_offset_s, update.sigmas)
+            self.estimate(update.calibration, update.sigmas)
         rr = self._rr
         self._log("tracker/matches", rr.Scalars([update.matches]))
         if update.chi2 is not None:
@@ -151,16 +152,15 @@ class Recording:
             self._said = said
             self._log("tracker/log", rr.TextLog(_sentence(update), level=_level(update)))
 
-    def estimate(self, cTl: gtsam.Pose3, time_offset_s: float, sigmas: FloatArray) -> None:
+    def estimate(self, calibration: Calibration, sigmas: FloatArray) -> None:
         """Extrinsic and time offset against the first ones, with 2 sigma.
 
         Args:
             sigmas: (7,) [rad, m, s].
         """
         if self._reference is None:
-            self._reference = Calibration(cTl, time_offset_s)
-        start, offset_s = self._reference
-        change = HUMAN * np.array([*gtsam.Pose3.Logmap(start.inverse() * cTl), time_offset_s - offset_s])
+            self._reference = calibration
+        change = HUMAN * self._reference.local_coordinates(calibration)
         band = 2.0 * HUMAN * sigmas
         for entity, value, width in zip(UNKNOWNS, change, band, strict=True):
             self._log(f"estimate/{entity}", self._rr.Scalars([value, value - width, value + width]))

@@ -12,6 +12,7 @@ import numpy as np
 from sst_graph.errors import count_of
 from sst_graph.inspect.inspection import HUMAN, NAMES, UNITS, Inspection, sigma_ellipse
 from sst_graph.inspect.planning import AT_REST_MPS, Plan
+from sst_graph.sampling import step_for
 from sst_graph.viz.graph_plot import draw_graph
 from sst_graph.viz.matplotlib_figure import figure_class
 
@@ -128,7 +129,7 @@ def draw_gains(figure: Any, inspection: Inspection) -> Any:
     )
     bottom.set_yticks(range(7), NAMES)
     figure.colorbar(picture, ax=bottom, label="growth of sigma without the frame [%]", extend="both")
-    step = max(1, -(-len(frames) // 20))
+    step = step_for(len(frames), 20)
     bottom.set_xticks(x[::step], [str(frames[k].frame.frame) for k in x[::step]])
     several = len({frame.frame.drive for frame in frames}) > 1
     for ax in (top, bottom):

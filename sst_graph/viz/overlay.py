@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.mask_contour import ContourMap
-from sst_graph.types import CameraImage, FloatArray, Frame, Scan, SemanticClass
+from sst_graph.odometry.cloud import transformed_points
+from sst_graph.types import Calibration, CameraImage, FloatArray, Frame, Scan, SemanticClass
 
 Picture = NDArray[np.uint8]
 Colour = tuple[int, int, int]
@@ -46,18 +47,14 @@ TIME_STEP_S = 0.5e-3
 """Points of a rolling sweep are moved in steps of this [s]; at 15 m/s the rest is 4 mm."""
 
 
-@dataclass(frozen=True)
-class Placement:
-    """One way to place the LiDAR in the camera: the pose, the offset, and a caption.
+@dataclass(frozen=True, eq=False)
+class Placement(Calibration):
+    """One way to place the LiDAR in the camera, and a caption.
 
     Attributes:
-        cTl: pose of the LiDAR in the camera.
-        time_offset_s: offset with the sign of :mod:`factors` [s].
         caption: words over the picture, such as "before".
     """
 
-    cTl: gtsam.Pose3
-    time_offset_s: float
     caption: str = ""
 
 
@@ -128,7 +125,7 @@ def _projected(
     c_twist: FloatArray | None,
 ) -> tuple[FloatArray, NDArray[np.uint8], FloatArray]:
     """Pixels (m, 2), classes (m,) and depths (m,) [m] of the points on the image, far ones first."""
-    cPs = _transformed(cTl, scan.points.astype(np.float64))
+    cPs = transformed_points(cTl, scan.points.astype(np.float64))
     if c_twist is not None:
         tau = (image.stamp_ns - scan.stamp_ns) * 1e-9 + time_offset_s
         offsets_s = np.zeros(len(cPs)) if scan.offsets_s is None else scan.offsets_s.astype(np.float64)
@@ -147,13 +144,8 @@ def _moved(cPs: FloatArray, taus_s: FloatArray, c_twist: FloatArray) -> FloatArr
     for step in np.unique(steps):
         chosen = steps == step
         motion = gtsam.Pose3.Expmap(-c_twist * float(taus_s[chosen].mean()))
-        moved[chosen] = _transformed(motion, cPs[chosen])
+        moved[chosen] = transformed_points(motion, cPs[chosen])
     return moved
-
-
-def _transformed(aTb: gtsam.Pose3, bPs: FloatArray) -> FloatArray:
-    """(n, 3) points in frame a; ``transformFrom`` itself flattens a batch of one."""
-    return bPs @ aTb.rotation().matrix().T + aTb.translation()
 
 
 def _backdrop(image: CameraImage) -> Picture:

@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import cv2
-import gtsam
 import numpy as np
 
 # Streets are built here, as the directory of a script is on its path.
@@ -21,6 +20,7 @@ from second_street import SecondStreet, StreetConfig
 from third_street import ThirdConfig, ThirdStreet
 
 from sst_graph import CalibrationConfig, calibrate
+from sst_graph.experiments.starts import error_of
 from sst_graph.types import SemanticClass
 
 Street = SecondStreet | ThirdStreet
@@ -53,10 +53,7 @@ def run(street: Street, classes: tuple[SemanticClass, ...], guess: bool) -> tupl
     rng = np.random.default_rng([config.seed, 99])
     away = np.concatenate([np.radians(rng.uniform(-12.0, 12.0, 3)), rng.uniform(-0.1, 0.1, 3)])
     result = calibrate(street, truth.cTl.retract(away) if guess else None, CalibrationConfig(classes=classes))
-    error = np.append(
-        gtsam.Pose3.Logmap(result.T_camera_lidar.between(truth.cTl)),
-        config.time_offset_s - result.time_offset_s,
-    )
+    error = error_of(result.calibration, truth)
     shift = result.T_camera_lidar.translation() - truth.cTl.translation()
     figures = [np.degrees(np.linalg.norm(error[:3])), 100 * np.abs(shift).mean(), 1e3 * abs(error[6])]
     for part in (slice(0, 3), slice(3, 6), slice(6, 7), slice(0, 7)):

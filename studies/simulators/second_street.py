@@ -35,6 +35,8 @@ _HEIGHT_M = 1.73
 _RANGE_M, _RANGE_NOISE_M, _LOST = 90.0, 0.02, 0.03
 _FINE = 5
 """Masks are drawn so many times finer and read at the pixels' centres."""
+_NEAR_M = 0.15
+"""Bodies are drawn from here on [m]."""
 
 
 @dataclass(frozen=True)
@@ -174,17 +176,17 @@ class SecondStreet:
         middle = _FINE // 2
         return mask[middle::_FINE, middle::_FINE].copy(), numbers[middle::_FINE, middle::_FINE].copy()
 
-    def _outline(self, cPs: FloatArray, near_m: float = 0.15) -> NDArray[np.int32] | None:
+    def _outline(self, cPs: FloatArray) -> NDArray[np.int32] | None:
         """Hull (k, 2) of a body's corners in the fine image, in sixteenths; None behind the camera."""
-        before = cPs[:, 2] > near_m
+        before = cPs[:, 2] > _NEAR_M
         if not before.any():
             return None
         if not before.all():
             edges = ConvexHull(cPs).simplices[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
             a, b = cPs[edges[:, 0]], cPs[edges[:, 1]]
-            crossing = (a[:, 2] > near_m) != (b[:, 2] > near_m)
+            crossing = (a[:, 2] > _NEAR_M) != (b[:, 2] > _NEAR_M)
             a, b = a[crossing], b[crossing]
-            cPs = np.concatenate([cPs[before], a + (b - a) * ((a[:, 2:] - near_m) / (a[:, 2:] - b[:, 2:]))])
+            cPs = np.concatenate([cPs[before], a + (b - a) * ((a[:, 2:] - _NEAR_M) / (a[:, 2:] - b[:, 2:]))])
         u = self.camera.fx * cPs[:, 0] / cPs[:, 2] + self.camera.cx
         v = self.camera.fy * cPs[:, 1] / cPs[:, 2] + self.camera.cy
         fine = np.clip(np.stack([u, v], axis=1), -4000.0, 6000.0) * _FINE + _FINE // 2

@@ -22,7 +22,7 @@ from sst_graph.factors import PinholeCamera, RobustKernel, residuals
 from sst_graph.factors.motion import CameraTwist
 from sst_graph.features.lidar_edges import Boundaries, Edge
 from sst_graph.features.mask_contour import ContourMap
-from sst_graph.types import PixelStretch, SemanticClass
+from sst_graph.types import Calibration, PixelStretch, SemanticClass
 
 VEHICLE = SemanticClass.VEHICLE
 CAMERA = PinholeCamera(300.0, 300.0, 160.3, 119.6, 320, 240)
@@ -68,7 +68,9 @@ def match(
     config: MatchConfig | None = None,
 ) -> SilhouetteMatches:
     pair = ScanWithImage({VEHICLE: points}, {VEHICLE: disc()}, CAMERA, base_tau_s, motion)
-    found = match_silhouettes(pair, cTl, time_offset_s, {VEHICLE: bias_px}, KERNEL, config or MatchConfig())
+    found = match_silhouettes(
+        pair, Calibration(cTl, time_offset_s), {VEHICLE: bias_px}, KERNEL, config or MatchConfig()
+    )
     return found[VEHICLE]
 
 
@@ -107,7 +109,7 @@ def test_gate_and_bias() -> None:
     # 60 px at 10 m are 73.2 px at 8.2 m: within the gate of 15 px, but not with a bias of 3 px on top.
     assert len(match(ring(), grown)) == 90
     pair = ScanWithImage({VEHICLE: ring()}, {VEHICLE: disc()}, CAMERA, 0.0, STILL)
-    assert match_silhouettes(pair, grown, 0.0, {VEHICLE: 3.0}, KERNEL, MatchConfig()) == {}
+    assert match_silhouettes(pair, Calibration(grown), {VEHICLE: 3.0}, KERNEL, MatchConfig()) == {}
 
 
 def test_where_an_image_is_enlarged_its_masks_err_as_much_more() -> None:
@@ -121,8 +123,7 @@ def test_where_an_image_is_enlarged_its_masks_err_as_much_more() -> None:
     one, other = (
         match_silhouettes(
             ScanWithImage({VEHICLE: ring()}, {VEHICLE: field}, CAMERA, 0.0, STILL),
-            moved,
-            0.0,
+            Calibration(moved),
             {VEHICLE: 0.3},
             KERNEL,
             MatchConfig(),
@@ -210,7 +211,7 @@ def test_what_different_rings_show_of_an_edge_errs_apart() -> None:
 
 def test_classes_without_a_contour_have_no_match() -> None:
     pair = ScanWithImage({VEHICLE: ring()}, {SemanticClass.POLE: disc()}, CAMERA, 0.0, STILL)
-    assert match_silhouettes(pair, CTL, 0.0, {}, KERNEL, MatchConfig()) == {}
+    assert match_silhouettes(pair, Calibration(CTL), {}, KERNEL, MatchConfig()) == {}
     pair = replace(pair, contours={VEHICLE: disc()})
     behind = gtsam.Pose3(gtsam.Rot3.Ry(np.pi), np.zeros(3)).compose(CTL)
-    assert match_silhouettes(pair, behind, 0.0, {}, KERNEL, MatchConfig()) == {}
+    assert match_silhouettes(pair, Calibration(behind), {}, KERNEL, MatchConfig()) == {}

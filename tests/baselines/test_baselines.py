@@ -33,9 +33,10 @@ from sst_graph.cli import main
 from sst_graph.data import open_source
 from sst_graph.drive.preparation import Drive, prepare_drive
 from sst_graph.errors import ConfigError
+from sst_graph.experiments.starts import errors_of
 from sst_graph.factors import beta_regularizer
-from sst_graph.metrics import CalibrationErrors, calibration_errors
-from sst_graph.result import CalibrationResult, read_result
+from sst_graph.metrics import calibration_errors
+from sst_graph.result import read_result
 from sst_graph.simulator import SimulationConfig
 from sst_graph.types import Calibration, GroundTruth, SemanticClass
 
@@ -85,10 +86,6 @@ def off_start(truth: GroundTruth) -> gtsam.Pose3:
     return gtsam.Pose3(
         gtsam.Rot3.Expmap(turn) * truth.cTl.rotation(), truth.cTl.translation() + np.array([0.03, 0, 0])
     )
-
-
-def errors_of(result: CalibrationResult, truth: GroundTruth) -> CalibrationErrors:
-    return calibration_errors(result.T_camera_lidar, result.time_offset_s, truth, result.covariance)
 
 
 @pytest.mark.slow

@@ -15,10 +15,10 @@ from stored import simulated
 from sst_graph import CalibrationConfig, calibrate, open_source
 from sst_graph.batch.by_edges.choice import with_method_for
 from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.experiments.starts import errors_of
 from sst_graph.fit import FitQuality
 from sst_graph.inspect.report import summary
 from sst_graph.inspect.verdict import quality_line
-from sst_graph.metrics import calibration_errors
 from sst_graph.simulator import SimulationConfig
 from sst_graph.types import CameraImage, Scan, SemanticClass
 from studies.edges_streets import source_of, start_step
@@ -71,7 +71,7 @@ def result():  # type: ignore[no-untyped-def]
 def test_a_street_without_labels(result) -> None:  # type: ignore[no-untyped-def]
     truth = unlabelled().truth
     assert truth is not None
-    errors = calibration_errors(result.T_camera_lidar, result.time_offset_s, truth, result.covariance)
+    errors = errors_of(result, truth)
     assert result.method == "edges" and result.config["method"] == "edges"
     assert result.status == "ok"
     assert errors.qad_deg < 0.4 and errors.atd_m < 0.06
@@ -136,7 +136,7 @@ def test_a_false_optimum_in_pitch_is_left() -> None:
     start = street.truth.cTl.retract(start_step(name))
     result = calibrate(street, start, CalibrationConfig(method="edges", check_contradictions=False))
     assert result.status == "ok"
-    errors = calibration_errors(result.T_camera_lidar, result.time_offset_s, street.truth, result.covariance)
+    errors = errors_of(result, street.truth)
     assert errors.qad_deg < 0.3 and errors.atd_m < 0.03
 
 
@@ -157,6 +157,6 @@ def test_real_drives_without_label_files(
     start = drive.truth.cTl.retract(np.array([*np.radians([3.0, -4.0, 2.5]), 0.06, -0.08, 0.05]))
     result = calibrate(drive, start)
     assert result.method == "edges" and result.status == "ok"
-    errors = calibration_errors(result.T_camera_lidar, result.time_offset_s, drive.truth, result.covariance)
+    errors = errors_of(result, drive.truth)
     assert errors.qad_deg < deg and errors.atd_m < metres
     assert errors.time_offset_s is not None and abs(errors.time_offset_s) < seconds

@@ -10,6 +10,7 @@ import pytest
 
 from sst_graph import CalibrationConfig, calibrate, open_source
 from sst_graph.config import with_overrides
+from sst_graph.experiments.starts import errors_of
 from sst_graph.metrics import calibration_errors
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -53,7 +54,7 @@ def test_a_steady_drive(use_motion: str, status: str) -> None:
         drive, drive.nominal, with_overrides(CalibrationConfig(), [f"use_motion={use_motion}"])
     )
     assert drive.truth is not None and drive.truth.time_offset_s is not None
-    errors = calibration_errors(result.T_camera_lidar, result.time_offset_s, drive.truth, result.covariance)
+    errors = errors_of(result, drive.truth)
     assert result.status == status
     assert errors.qad_deg < 0.1
     if status == "ok":

@@ -17,6 +17,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from checks.fuzz_mutations import png_chunks, png_of
 from sst_graph.data.decoder_output import decoder_output
 from sst_graph.data.images import picture_size, read_instances, read_mask, read_picture
 from sst_graph.errors import DataError
@@ -33,34 +34,16 @@ def encoded(suffix: str, image: NDArray[Any] | None = None, *parameters: int) ->
     return cv2.imencode(suffix, picture() if image is None else image, list(parameters))[1].tobytes()
 
 
-def chunks(png: bytes) -> list[tuple[bytes, bytes]]:
-    at, found = 8, []
-    while at < len(png):
-        (length,) = struct.unpack_from(">I", png, at)
-        found.append((png[at + 4 : at + 8], png[at + 8 : at + 8 + length]))
-        at += 12 + length
-    return found
-
-
-def joined(parts: list[tuple[bytes, bytes]]) -> bytes:
-    """A PNG file of chunks, each with its right checksum."""
-    body = (
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-        for kind, data in parts
-    )
-    return b"\x89PNG\r\n\x1a\n" + b"".join(body)
-
-
 def with_header(width: int, height: int, depth: int = 8, colour: int = 2) -> bytes:
     header = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
-    return joined([(b"IHDR", header), *chunks(encoded(".png"))[1:]])
+    return png_of([(b"IHDR", header), *png_chunks(encoded(".png"))[1:]])
 
 
 def with_data(change: Any) -> bytes:
     """The picture with its compressed data, in one chunk, changed."""
-    parts = chunks(encoded(".png"))
+    parts = png_chunks(encoded(".png"))
     data = change(b"".join(data for kind, data in parts if kind == b"IDAT"))
-    return joined([parts[0], (b"IDAT", data), parts[-1]])
+    return png_of([parts[0], (b"IDAT", data), parts[-1]])
 
 
 JPEG = encoded(".jpg")
@@ -119,7 +102,7 @@ def test_damaged_pictures_are_refused_and_nothing_is_printed(
         encoded(".png"),
         encoded(".png") + b"trailing",
         # What libpng warns of, but no pixel is touched by it.
-        joined([*chunks(encoded(".png"))[:1], (b"iCCP", b"bad\0\0"), *chunks(encoded(".png"))[1:]]),
+        png_of([*png_chunks(encoded(".png"))[:1], (b"iCCP", b"bad\0\0"), *png_chunks(encoded(".png"))[1:]]),
     ],
 )
 def test_whole_pictures_print_nothing(tmp_path: Path, data: bytes, capfd: pytest.CaptureFixture[str]) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sst_graph import calibrate
+from sst_graph.experiments.starts import error_of
 from sst_graph.types import SemanticClass
 from studies.simulators.second_street import SecondStreet, StreetConfig
 from studies.simulators.third_street import ThirdConfig, ThirdStreet
@@ -46,8 +47,6 @@ def test_points_and_masks_agree() -> None:
 def test_a_street_with_a_stop(street: SecondStreet | ThirdStreet, away: tuple[float, ...]) -> None:
     result = calibrate(street, street.truth.cTl * gtsam.Pose3.Expmap(np.array(away)))
     assert result.status != "not_converged"
-    error = np.append(
-        gtsam.Pose3.Logmap(result.T_camera_lidar.between(street.truth.cTl)), 0.1 - result.time_offset_s
-    )
+    error = error_of(result.calibration, street.truth)
     assert np.degrees(np.linalg.norm(error[:3])) < 0.3
     assert error @ np.linalg.solve(result.covariance, error) < 3.0 * 7

@@ -16,6 +16,7 @@ from sst_graph.factors import FactorError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.marginal import carried, separated
 from sst_graph.result import CalibrationResult
+from sst_graph.types import Calibration
 
 FloatArray = NDArray[np.float64]
 
@@ -66,8 +67,7 @@ def marginals(rng: np.random.Generator, count: int) -> list[CalibrationMarginal]
 
 
 def error_of(marginal: CalibrationMarginal) -> FloatArray:
-    best = marginal.best()
-    return np.append(TRUE.localCoordinates(best.cTl), best.time_offset_s - 0.02)
+    return Calibration(TRUE, 0.02).local_coordinates(marginal.best())
 
 
 def test_the_steps_of_a_result() -> None:
@@ -141,7 +141,7 @@ def test_agreement_is_as_likely_as_said() -> None:
 def test_another_point_keeps_the_errors_that_it_stands_for() -> None:
     one = marginal_of_result(result(4, np.full(7, 1e-3)))
     turn = np.radians(2.0)
-    there = carried(one, TRUE.retract(np.array([turn, -turn, turn, 0.05, 0.0, 0.02])), 0.03)
+    there = carried(one, Calibration(TRUE.retract(np.array([turn, -turn, turn, 0.05, 0.0, 0.02])), 0.03))
     best, d = there.best(), there.covariance() @ there.vector
     assert best.cTl.equals(one.cTl, 1e-12)
     for name, step in one.common.errors.items():

@@ -45,12 +45,12 @@ def test_cpp_reads_the_same_cost(reader: Path, tmp_path: Path) -> None:
     factor, lines, costs, steps = marginal.factor(), [], [], []
     for size in (0.0, 1e-6, 1e-2, 1.0):
         d = size * rng.uniform(-0.5, 0.5, 7)
-        cTl, time_offset_s = marginal.cTl.retract(d[:6]), marginal.time_offset_s + d[6]
+        cTl, time_offset_s = there = marginal.at.retract(d)
         values = gtsam.Values()
         values.insert(EXTRINSIC, cTl)
         values.insert(TIME_OFFSET, np.array([time_offset_s]))
         costs.append(factor.error(values))
-        steps.append([*gtsam.Pose3.Logmap(marginal.cTl.between(cTl)), time_offset_s - marginal.time_offset_s])
+        steps.append(marginal.at.local_coordinates(there))
         lines.append(" ".join(repr(float(x)) for x in [*cTl.matrix()[:3].ravel(), time_offset_s]))
     done = subprocess.run(
         [reader, path], input="\n".join(lines), capture_output=True, text=True, check=True, timeout=60

@@ -36,7 +36,7 @@ from sst_graph.graph.matching import GraphConfig, associate
 from sst_graph.graph.state import State
 from sst_graph.result import CalibrationResult
 from sst_graph.simulator import SimulationConfig
-from sst_graph.types import SemanticClass
+from sst_graph.types import Calibration, SemanticClass
 
 CAMERA = PinholeCamera(718.0, 718.0, 607.0, 185.0, 1242, 375)
 FORWARD = gtsam.Rot3(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]))
@@ -99,8 +99,7 @@ def solved(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> tuple[gts
 
 def in_sigmas(found: CalibrationMarginal, cTl: gtsam.Pose3, time_offset_s: float) -> float:
     """Distance of the marginal's optimum from an estimate, in the marginal's own sigmas."""
-    best, best_time_offset_s = found.best()
-    d = np.append(best.localCoordinates(cTl), time_offset_s - best_time_offset_s)
+    d = found.best().local_coordinates(Calibration(cTl, time_offset_s))
     return float(np.sqrt(d @ found.information @ d))
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from sst_graph.factors import CameraTwist, move_points
 from sst_graph.factors.motion import (
+    cross_rows,
     exponential_coefficients,
     group_poses,
     move_groups,
@@ -160,3 +161,9 @@ def test_groups_move_as_their_points_do_each_with_its_own_tau_and_image(objects:
     moved.write_rows(g, rows)
     lifts = np.repeat(moved.lift, counts, axis=0)
     np.testing.assert_allclose(np.einsum("nij,jkn->ikn", lifts, rows), expected, rtol=1e-10, atol=1e-10)
+
+
+def test_cross_products_of_rows() -> None:
+    a, b = np.random.default_rng(3).normal(size=(2, 7, 3))
+    np.testing.assert_allclose(cross_rows(a, b), np.cross(a, b), rtol=1e-12)
+    np.testing.assert_allclose(cross_rows(a[0], b), np.cross(a[0], b), rtol=1e-12)

@@ -31,7 +31,7 @@ def apart_in_sigmas(
 
 def assert_same(one: Smoothed, other: Smoothed, sigmas: float) -> None:
     """Two estimates and their covariances, in sigmas of the second; curvature leaves thousandths of one."""
-    d = np.append(other.cTl.localCoordinates(one.cTl), one.time_offset_s - other.time_offset_s)
+    d = other.local_coordinates(one)
     assert np.sqrt(d @ np.linalg.solve(other.covariance, d)) < sigmas
     scale = 1.0 / np.sqrt(np.diag(other.covariance))
     np.testing.assert_allclose(
@@ -89,7 +89,7 @@ def test_without_a_walk_it_is_the_fusion_of_marginals() -> None:
     still = WalkConfig(rotation_deg=1e-4, translation_m=1e-5, time_offset_s=1e-6)
     fused = fuse_marginals([one.marginal for one in drives], significance=0.0)
     for one in smoothed(drives, (), still):
-        d = np.append(fused.cTl.localCoordinates(one.cTl), one.time_offset_s - fused.time_offset_s)
+        d = fused.at.local_coordinates(one)
         assert np.sqrt(d @ fused.information @ d) < 0.02
         np.testing.assert_allclose(np.diag(one.covariance), np.diag(fused.covariance()), rtol=0.02)
 
@@ -127,7 +127,7 @@ def test_elimination_in_turn_is_one_graph() -> None:
     for k, found in enumerate(smoothed(drives, steps, config)):
         covariance = marginals.jointMarginalCovariance([EXTRINSIC + k, TIME_OFFSET + k]).fullMatrix()
         time_offset_s = float(best.atVector(TIME_OFFSET + k)[0])
-        assert_same(found, Smoothed(best.atPose3(EXTRINSIC + k), time_offset_s, covariance), 0.01)
+        assert_same(found, Smoothed(best.atPose3(EXTRINSIC + k), time_offset_s, covariance=covariance), 0.01)
 
 
 def test_the_ends_of_a_stretch_have_one_side() -> None:

@@ -18,7 +18,7 @@ from sst_graph.graph.drive_motion import DriveMotion, motions_of
 from sst_graph.graph.frozen_problem import FrozenProblem, NormalEquations
 from sst_graph.graph.known import KnownCalibration
 from sst_graph.graph.matching import DriveMatches, GraphConfig, associate, edges_of, match_all
-from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
+from sst_graph.graph.state import EXTRINSIC, State, difference, time_offset_key
 from sst_graph.objects.dynamic_objects import DynamicObject
 from sst_graph.objects.tracks import ObjectId, object_tracks
 from sst_graph.objects.velocity import ObjectVelocity
@@ -215,18 +215,12 @@ def test_the_optimum_is_the_graphs() -> None:
     assert system.cost < problem.linearized(problem.start).cost
     found, expected = problem.state_at(point), state_from(optimum, state, pairs)
     sigmas = np.sqrt(np.diag(system.covariance())[:7])
-    away = np.append(
-        gtsam.Pose3.Logmap(expected.cTl.between(found.cTl)),
-        found.time_offsets_s[0] - expected.time_offsets_s[0],
-    )
-    assert np.abs(away / sigmas).max() < 0.01
+    assert np.abs(difference(expected, found) / sigmas).max() < 0.01
     assert found.object_biases_px.keys() == expected.object_biases_px.keys()
     # The length of the step in deviations, by gtsam's own covariance.
     marginals = gtsam.Marginals(graph, problem.values_at(point))
     joint = marginals.jointMarginalCovariance([EXTRINSIC, time_offset_key()])
-    step = np.append(
-        gtsam.Pose3.Logmap(state.cTl.between(point.cTl)), found.time_offsets_s[0] - state.time_offsets_s[0]
-    )
+    step = difference(state, found)
     length = float(np.sqrt(step @ np.linalg.solve(joint.fullMatrix(), step)))
     assert problem.step_sigmas(point, system) == pytest.approx(length, rel=1e-4)
 

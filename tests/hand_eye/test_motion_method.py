@@ -18,11 +18,11 @@ from sst_graph.cli import main
 from sst_graph.config import with_overrides
 from sst_graph.data import open_source
 from sst_graph.errors import ConfigError, EstimationError
+from sst_graph.experiments.starts import errors_of
 from sst_graph.graph.state import State, difference
 from sst_graph.hand_eye.graph import NoiseScales, camera_steps, hand_eye_terms, lidar_paths, pair_motions
 from sst_graph.hand_eye.initialization import motion_starts
 from sst_graph.hand_eye.solution import MotionSolution, alternative, solve_motion
-from sst_graph.metrics import calibration_errors
 from sst_graph.result import read_result
 from sst_graph.simulator import SimulationConfig
 from sst_graph.types import Guess
@@ -210,7 +210,7 @@ def test_from_the_command_line(street: Path, tmp_path: Path, start: str) -> None
     result = read_result(out / "calibration.json")
     truth = open_source(street).truth
     assert truth is not None
-    errors = calibration_errors(result.T_camera_lidar, result.time_offset_s, truth, result.covariance)
+    errors = errors_of(result, truth)
     # Height and sideways shift stay open on a plane road: never a confident wrong number.
     assert (code, result.status, result.method) == (3, "unobservable", "motion")
     assert errors.qad_deg < 0.6 and errors.time_offset_s is not None and abs(errors.time_offset_s) < 0.006

@@ -20,7 +20,7 @@ from sst_graph.graph.frozen_problem import FrozenProblem
 from sst_graph.graph.matching import GraphConfig, edges_of, match_all
 from sst_graph.graph.state import State
 from sst_graph.initialization.pose_batch import BatchEquations, PoseBatch, Poses
-from sst_graph.types import RelativeMotion, SemanticClass
+from sst_graph.types import Calibration, RelativeMotion, SemanticClass
 
 VEHICLE = SemanticClass.VEHICLE
 CAMERA = PinholeCamera(100.0, 100.0, 320.0, 100.0, 640, 200)
@@ -124,7 +124,7 @@ def test_each_pose_has_the_matches_that_it_has_alone(scale_px: float) -> None:
         for scan, image in zip(drive.scans, drive.images, strict=True):
             motion = CameraTwist(np.zeros(6), np.zeros(6))
             pair = ScanWithImage(scan.boundaries, image.contours, drive.camera, 0.0, motion)
-            found = match_silhouettes(pair, cTl, 0.0, {}, kernel(scale_px), MatchConfig())
+            found = match_silhouettes(pair, Calibration(cTl), {}, kernel(scale_px), MatchConfig())
             r = _distances(found[VEHICLE].alignment, cTl)
             matches += float(kernel(scale_px).weight(r / found[VEHICLE].alignment.sigmas_px).sum())
             seen += found[VEHICLE].seen

@@ -354,7 +354,7 @@ def test_points_are_drawn_where_their_residuals_say(by: str) -> None:
     points = fit.points.take(fit.points.frames == frame)
     drawn = DriveReader([source]).frame(fit.frames[frame])
     assert drawn is not None
-    uvs, depths = project_points(drawn, points, Calibration(result.T_camera_lidar, result.time_offset_s))
+    uvs, depths = project_points(drawn, points, result.calibration)
     across = ((uvs - points.pixels) * points.normals).sum(axis=1)
     assert np.ptp(points.residuals_px - across) < 0.05  # the mask bias, the same for all
     assert (depths > 0.0).all()

@@ -96,7 +96,7 @@ def test_with_nothing_known_the_fit_is_that_of_the_camera_by_itself(name: str) -
     assert not fit.by_edges and len(fit.profiles) == 7 and len(fit.iterations) > 1
     assert FitQuality.from_diagnostics(result.diagnostics) == fit.quality
     assert fit.quality.share > fit.quality.attainable - 0.05
-    assert misfit_px(result, name, Calibration(result.T_camera_lidar, result.time_offset_s)) < 0.01
+    assert misfit_px(result, name, result.calibration) < 0.01
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -105,7 +105,7 @@ def test_the_fit_is_measured_at_the_answer_of_the_rig(name: str) -> None:
     own = result.diagnostics["by_own_images"]
     alone = Calibration(gtsam.Pose3(np.array(own["T_camera_lidar"])), own["time_offset_s"])
     assert together().diagnostics["known_poses"][0]["used"]
-    assert misfit_px(result, name, Calibration(result.T_camera_lidar, result.time_offset_s)) < 0.01
+    assert misfit_px(result, name, result.calibration) < 0.01
     assert misfit_px(result, name, alone) > 0.1
     fit = fit_of(result)
     # Those of the estimate by its own images are left out: it is another one.

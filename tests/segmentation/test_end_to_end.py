@@ -15,7 +15,7 @@ from streets import SHORT_STREET
 from sst_graph.cli import main
 from sst_graph.data import open_source
 from sst_graph.data.kept_drive import KeptDrive
-from sst_graph.metrics import calibration_errors
+from sst_graph.experiments.starts import errors_of
 from sst_graph.result import read_result
 from sst_graph.segmentation import open_image_segmenter, open_scan_segmenter
 from sst_graph.simulator import SimulationConfig, simulate
@@ -123,7 +123,7 @@ def test_a_drive_without_labels_is_calibrated_by_networks(
     assert first.time_offset_s == second.time_offset_s
     truth = open_source(unlabelled).truth
     assert truth is not None
-    errors = calibration_errors(first.T_camera_lidar, first.time_offset_s, truth, first.covariance)
+    errors = errors_of(first, truth)
     assert errors.qad_deg < 0.5
     assert errors.atd_m < 0.05
     assert first.method == "joint"

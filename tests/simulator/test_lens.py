@@ -13,8 +13,8 @@ from sst_graph.batch import calibrate_prepared, prepare_drives
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.cameras import BrownConradyCamera, CameraModel, FisheyeCamera, Rectification
 from sst_graph.data.rectified import RectifiedSource
+from sst_graph.experiments.starts import errors_of
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.metrics import calibration_errors
 from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.types import SemanticClass, Source
 from studies.simulators.lens import LensDrive
@@ -91,6 +91,6 @@ def test_a_street_through_a_lens_calibrates(name: str, most_deg: float) -> None:
     source: Source = RectifiedSource(LensDrive(drive, rectification.model), rectification)
     config = CalibrationConfig()
     result = calibrate_prepared(prepare_drives([source], config), drive.nominal, config)
-    errors = calibration_errors(result.T_camera_lidar, result.time_offset_s, drive.truth, result.covariance)
+    errors = errors_of(result, drive.truth)
     assert errors.qad_deg < most_deg, errors
     assert errors.atd_m < 0.05, errors

@@ -20,12 +20,12 @@ from sst_graph import CalibrationConfig, Tracker, TrackerConfig, open_source
 from sst_graph.association.edge_matching import MatchConfig
 from sst_graph.batch.by_edges.problem import POINTS_A_SCAN
 from sst_graph.cli import main
+from sst_graph.experiments.starts import errors_of
 from sst_graph.factors.alignment import weighted_residuals
 from sst_graph.features.picture_gradients import PictureGradients
 from sst_graph.graph.known import KnownCalibration
 from sst_graph.graph.state import State
 from sst_graph.hand_eye.graph import camera_steps
-from sst_graph.metrics import calibration_errors
 from sst_graph.result import CalibrationResult, read_result
 from sst_graph.tracker.by_edges.review import EdgeReview, variance_ratio
 from sst_graph.tracker.estimate import OnlineEstimate
@@ -34,7 +34,7 @@ from sst_graph.tracker.start.initializer import InitialGraph
 from sst_graph.tracker.sums.held import EDGE_ERRORS, SHIFTS, edge_error_columns, held_names
 from sst_graph.tracker.track_update import TrackUpdate
 from sst_graph.types import CameraImage, Frame, Scan, SemanticClass, Source
-from studies.edges_streets import source_of, start_step
+from studies.edges_streets import error_of, source_of, start_step
 
 VEHICLE, OBJECT, IGNORE = SemanticClass.VEHICLE, SemanticClass.OBJECT, int(SemanticClass.IGNORE)
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -149,8 +149,7 @@ def test_scans_that_leave_the_window_keep_what_edges_share() -> None:
     smoother = tracker.estimate.smoother
     assert smoother is not None and len(smoother.entries) <= FRAMES and smoother.sums.weight > 0.0
     np.testing.assert_allclose(np.diag(tracker.estimate.uncertainty.edge_share)[:3], 1.0, atol=0.02)
-    late = update.time_offset_s - (street.truth.time_offset_s or 0.0)
-    step = np.append(street.truth.cTl.localCoordinates(update.T_camera_lidar), late)
+    step = error_of(update.calibration, street.truth)
     assert (np.abs(step) < 4.0 * update.sigmas).all()
 
 
@@ -330,11 +329,10 @@ def test_a_real_drive_without_label_files(
     np.testing.assert_array_equal(last["T_camera_lidar"], result.T_camera_lidar.matrix())
     np.testing.assert_array_equal(last["covariance"], result.covariance)
     assert last["time_offset_s"] == result.time_offset_s and last["status"] in statuses
-    errors = calibration_errors(result.T_camera_lidar, result.time_offset_s, truth, result.covariance)
+    errors = errors_of(result, truth)
     assert errors.qad_deg < 0.25 and errors.atd_m < 0.03
     assert errors.time_offset_s is not None and abs(errors.time_offset_s) < 0.015
-    late = result.time_offset_s - truth.time_offset_s
-    step = np.append(truth.cTl.localCoordinates(result.T_camera_lidar), late)
+    step = error_of(result.calibration, truth)
     assert (np.abs(step) < 3.0 * np.sqrt(np.diag(result.covariance))).all()
 
 
@@ -355,9 +353,7 @@ def test_a_street_without_labels(name: str) -> None:
     assert truth is not None and truth.time_offset_s is not None
     _, update = tracked(street, truth.cTl.retract(start_step(name)))
     assert update.status == "ok"
-    step = np.append(
-        truth.cTl.localCoordinates(update.T_camera_lidar), update.time_offset_s - truth.time_offset_s
-    )
+    step = error_of(update.calibration, truth)
     assert np.degrees(np.linalg.norm(step[:3])) < 0.25 and np.linalg.norm(step[3:6]) < 0.05
     assert abs(step[6]) < 0.01 and (np.abs(step) < 3.0 * update.sigmas).all()
 

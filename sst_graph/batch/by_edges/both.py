@@ -87,7 +87,7 @@ def _started_at(guess: Guess, part: _Part) -> _Part:
 
 def _fit_at(fused: State, part: MethodEstimate) -> Fit | None:
     """How a part's labels or edges fit the estimate of both."""
-    return None if part.matched is None else part.matched.fit_at(fused.cTl, fused.time_offsets_s[0])
+    return None if part.matched is None else part.matched.fit_at(fused.calibration())
 
 
 def _usable(part: _Part) -> bool:

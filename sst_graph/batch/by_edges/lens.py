@@ -237,7 +237,7 @@ def lens_beside_labels(
     """
     # 1. Some frames once more, for their edges.
     offsets_s = [state.time_offset_s(number) for number in range(len(problem.drives))]
-    some = problem_of_some_frames(problem.drives, offsets_s, Guess(state.cTl, offsets_s[0]), problem.config)
+    some = problem_of_some_frames(problem.drives, offsets_s, Guess(*state.calibration()), problem.config)
     if some is None:
         return ()
     # 2. The lens by these, from the estimate.

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sst_graph.drive.preparation import Drive, ScanFeatures
 from sst_graph.features.lidar_edges import Edge, with_points
 from sst_graph.objects.tracks import ObjectId, numbers_in, of_each
+from sst_graph.sampling import step_for
 from sst_graph.types import SemanticClass
 
 
@@ -22,7 +23,7 @@ def thinned(drive: Drive, most: int) -> Drive:
 def thinned_scan(scan: ScanFeatures, most: int, classes: Collection[SemanticClass]) -> ScanFeatures:
     """The scan with at most so many boundary points, evenly spread, of each of some classes."""
     boundaries = {
-        c: points.take(np.arange(0, len(points), max(1, -(-len(points) // most)))) if c in classes else points
+        c: points.take(np.arange(0, len(points), step_for(len(points), most))) if c in classes else points
         for c, points in scan.boundaries.items()
     }
     return replace(scan, boundaries=boundaries)

@@ -176,7 +176,7 @@ def edges_problem(
     """
     guess = calibration.guess
     if labels.state is not None:
-        guess = Guess(labels.state.cTl, labels.state.time_offsets_s[0])
+        guess = Guess(*labels.state.calibration())
     if guess.cTl is None and motion is None:
         raise EstimationError(
             "without labels, a start is needed: a guess within 5 deg (--init), or a drive whose motion "

@@ -76,5 +76,5 @@ def _before(choice: str, result: CalibrationResult, source: Source) -> Placement
         if (nominal := nominal_of(source)) is None:
             raise ConfigError(f"{source.name} brings no nominal calibration to compare with")
         return nominal
-    cTl, time_offset_s = load_initial(Path(choice), result.camera_name)
-    return Placement(cTl, time_offset_s, f"before ({Path(choice).name})")
+    start = load_initial(Path(choice), result.camera_name)
+    return Placement(**vars(start), caption=f"before ({Path(choice).name})")

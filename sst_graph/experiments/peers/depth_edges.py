@@ -21,6 +21,7 @@ from scipy.ndimage import distance_transform_cdt
 
 from sst_graph.errors import EstimationError
 from sst_graph.experiments.peers.frames import PeerFrame, PeerProblem, moved_by
+from sst_graph.sampling import step_for
 from sst_graph.types import FloatArray
 
 _ALPHA, _GAMMA = 1.0 / 3.0, 0.98
@@ -51,7 +52,7 @@ class _EdgeFrame:
     @classmethod
     def of(cls, frame: PeerFrame) -> _EdgeFrame:
         found = np.flatnonzero(frame.jumps > _LEAST_JUMP_M)
-        found = found[:: max(1, -(-len(found) // _POINTS))]
+        found = found[:: step_for(len(found), _POINTS)]
         return cls(frame, frame.lPs[found], np.sqrt(frame.jumps[found]), edge_map(frame.grey))
 
     def scores(self, poses: FloatArray) -> FloatArray:

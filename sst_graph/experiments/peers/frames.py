@@ -15,6 +15,7 @@ from sst_graph.drive.preparation import Drive
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.lidar_beams import arrange_beams
+from sst_graph.odometry.cloud import transformed_points
 from sst_graph.sampling import evenly_spread
 from sst_graph.types import (
     CameraImage,
@@ -56,7 +57,7 @@ class PeerFrame:
 
     def pixels(self, cTl: gtsam.Pose3, lPs: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
         """Indices (m,) of points (n, 3) that fall on the image, and their pixels (m, 2) [px]."""
-        cPs = lPs @ cTl.rotation().matrix().T + cTl.translation()
+        cPs = transformed_points(cTl, lPs)
         ahead = np.flatnonzero(self.camera.in_front(cPs))
         uvs = self.camera.project(cPs[ahead])
         inside = self.camera.in_image(uvs)

@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 from sst_graph.association.nearest import sample_pixels
 from sst_graph.errors import EstimationError
 from sst_graph.experiments.peers.frames import PeerFrame, PeerProblem, moved_by
+from sst_graph.sampling import step_for
 from sst_graph.types import FloatArray, SemanticClass
 
 _POINTS, _PIXEL_SHARE = 800, 0.02
@@ -90,5 +91,5 @@ def _class_frame(frame: PeerFrame, rng: np.random.Generator) -> _ClassFrame | No
     shown = frame.mask == SemanticClass.VEHICLE
     if len(lPs) == 0 or not shown.any():
         return None
-    lPs = lPs[:: max(1, -(-len(lPs) // _POINTS))]
+    lPs = lPs[:: step_for(len(lPs), _POINTS)]
     return _ClassFrame(frame, lPs, distance_transform_edt(~shown), sample_pixels(shown, _PIXEL_SHARE, rng))

@@ -25,6 +25,7 @@ from scipy.spatial import cKDTree
 
 from sst_graph.experiments.peers.frames import PeerFrame, PeerProblem, moved_by
 from sst_graph.odometry.lidar import GROUND_CLASSES
+from sst_graph.sampling import step_for
 from sst_graph.types import FloatArray, IntArray
 
 _NORMALS_OF = 40
@@ -156,7 +157,7 @@ def _segmented(frame: PeerFrame) -> tuple[IntArray, FloatArray, IntArray, IntArr
     """Points that are kept (m,), where they are (m, 3) [m], directions of their normals, segments (m,)."""
     ahead = np.flatnonzero(frame.lPs[:, 0] > 0.0)
     tree = cKDTree(frame.lPs[ahead])
-    some = ahead[:: max(1, -(-len(ahead) // _POINTS))]
+    some = ahead[:: step_for(len(ahead), _POINTS)]
     lPs = frame.lPs[some]
     around = frame.lPs[ahead][tree.query(lPs, min(_NORMALS_OF, len(ahead)))[1]]
     off = around - around.mean(axis=1, keepdims=True)

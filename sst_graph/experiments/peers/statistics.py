@@ -24,6 +24,7 @@ from scipy.optimize import minimize
 
 from sst_graph.errors import EstimationError
 from sst_graph.experiments.peers.frames import PeerFrame, PeerProblem, moved_by
+from sst_graph.sampling import step_for
 from sst_graph.types import FloatArray
 
 _NID_BINS, _OUTER = 16, 10
@@ -130,7 +131,7 @@ def _visible(frame: PeerFrame, grey: NDArray[np.uint8], cTl: gtsam.Pose3) -> _Se
     nearest = np.full(int(cells.max()) + 1 if len(cells) else 1, np.inf)
     np.minimum.at(nearest, cells, depth)
     kept = inside[depth < _HIDDEN * nearest[cells]]
-    kept = kept[:: max(1, -(-len(kept) // _POINTS))]
+    kept = kept[:: step_for(len(kept), _POINTS)]
     assert frame.intensities is not None
     return _Seen(frame, grey, frame.lPs[kept], _equalized(frame.intensities)[kept])
 

@@ -250,13 +250,7 @@ def _drifts(vehicles: Sequence[Vehicle]) -> str:
 
 def _charts(vehicle: Vehicle) -> list[str]:
     first, days = vehicle.drift[0], np.array(vehicle.days)
-    steps = np.array(
-        [
-            [*first.cTl.localCoordinates(one.cTl), one.time_offset_s - first.time_offset_s]
-            for one in vehicle.drift
-        ]
-    )
-    human = steps * HUMAN
+    human = np.array([first.local_coordinates(one) for one in vehicle.drift]) * HUMAN
     sigmas = np.sqrt([np.diag(one.covariance) for one in vehicle.drift]) * HUMAN
     stretches = _stretches(vehicle)
     marked = np.concatenate(stretches)

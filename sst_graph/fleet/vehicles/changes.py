@@ -128,14 +128,14 @@ def _alone(both_ways: Passes, left: Sequence[DriveEstimate], k: int, hypotheses:
 
 
 def _compared(one: Separated, other: Separated, hypotheses: int) -> Finding:
-    cTl, time_offset_s = one.own.best()
+    best = one.own.best()
     parts = []
     for separate in (one, other):
-        there = separate.carried(cTl, time_offset_s)
+        there = separate.carried(best)
         covariance = there.own.covariance()
         parts.append(PartEstimate(covariance @ there.own.vector, covariance, common=there.errors))
     difference = Difference.of(parts[0], parts[1])
-    return Finding(difference, cTl, min(1.0, hypotheses * difference.p_value))
+    return Finding(difference, best.cTl, min(1.0, hypotheses * difference.p_value))
 
 
 def _without(state: Findings, k: int, finding: Finding) -> Findings:

@@ -127,7 +127,7 @@ def vehicle_of(
     by_name = {drive.name: drive for drive in counted}
     changes = _changes(found, by_name)
     last = drift[-1]
-    calibration = Smoothed(last.cTl, last.time_offset_s, last.covariance + last.common)
+    calibration = Smoothed(*last, covariance=last.covariance + last.common)
     weak = weak_directions(calibration.covariance, calibration.cTl, limits)
     status: VehicleStatus = "unobservable" if weak else "ok"
     if changes or found.contradicting:

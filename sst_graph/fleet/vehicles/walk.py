@@ -22,7 +22,7 @@ from sst_graph.config import Settings, setting
 from sst_graph.export import EXTRINSIC, TIME_OFFSET, CalibrationMarginal, marginal_of_graph
 from sst_graph.factors import extrinsic_drift, time_offset_drift
 from sst_graph.marginal import Separated, separated
-from sst_graph.types import FloatArray
+from sst_graph.types import Calibration, FloatArray
 
 _DAY_S = 86400.0
 _LEAST_DAYS = 1.0 / 24.0
@@ -62,19 +62,16 @@ class DriveEstimate:
 
 
 @dataclass(frozen=True, eq=False)
-class Smoothed:
+class Smoothed(Calibration):
     """The calibration at one drive, by all drives of its stretch.
 
     Attributes:
-        cTl, time_offset_s: the estimate.
         covariance: (7, 7) right perturbation, order of the conventions: that of differences from drive to
             drive, without what all drives have in common.
         common: (7, 7) covariance by that.
     """
 
-    cTl: gtsam.Pose3
-    time_offset_s: float
-    covariance: FloatArray
+    covariance: FloatArray = field(kw_only=True)
     common: FloatArray = field(default_factory=lambda: np.zeros((7, 7)))
 
 
@@ -92,8 +89,8 @@ def smoothed(drives: Sequence[DriveEstimate], steps: Collection[int], config: Wa
     found = []
     for upto, after in zip(both_ways.upto, both_ways.after, strict=True):
         both = upto if after is None else upto.plus(after)
-        cTl, time_offset_s = both.own.best()
-        found.append(Smoothed(cTl, time_offset_s, both.own.covariance(), both.common_covariance()))
+        own, common = both.own.covariance(), both.common_covariance()
+        found.append(Smoothed(**vars(both.own.best()), covariance=own, common=common))
     return found
 
 
@@ -136,7 +133,7 @@ def _one_pass(
             prediction = Separated(walked(last.own, days[k - 1], config), last.errors)
         both = part if prediction is None else prediction.plus(part)
         predictions.append(prediction)
-        together.append(both.carried(*both.own.best()))
+        together.append(both.carried(both.own.best()))
     return predictions, together
 
 

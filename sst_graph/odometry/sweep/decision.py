@@ -19,10 +19,8 @@ from sst_graph.types import FloatArray, Scan
 
 _LOG = logging.getLogger(__name__)
 
-Hypothesis = Literal["compensated", "clockwise", "counterclockwise"]
 SweepKind = Literal["compensated", "clockwise", "counterclockwise", "undecided", "standstill", "given"]
-"""One of the hypotheses; or none, for they are not excluded, or do not matter at standstill, or the times are
-given."""
+"""What the scans show of the sweep; undecided, or of no matter at standstill; or the times are given."""
 FRACTIONS: dict[str, float] = {"compensated": 0.0, "clockwise": -1.0, "counterclockwise": 1.0}
 
 CLAIMS: dict[str, str] = {

@@ -21,10 +21,11 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from sst_graph.factors.motion import cross
-from sst_graph.odometry.cloud import compensate_sweep, usable_points
+from sst_graph.factors.motion import cross, cross_rows
+from sst_graph.odometry.cloud import compensate_sweep, transformed_by, usable_points
 from sst_graph.odometry.lidar import GROUND_CLASSES, TESTED_CLASSES, LidarOdometry, orthonormal
 from sst_graph.odometry.static_points import on_static_objects
+from sst_graph.sampling import spread_places
 from sst_graph.sweep_timing import turned
 from sst_graph.types import FloatArray, Scan
 
@@ -186,10 +187,7 @@ class Window:
         """Points of each scan on the ground and static objects (in its LiDAR frame) [m]."""
         found = []
         parts = [usable_points(scan, _NEAR_M, _FAR_M, _MAX_POINTS)[:2] for scan in scans]
-        world = [
-            points @ pose[:3, :3].T + pose[:3, 3]
-            for (points, _), pose in zip(parts, self._poses, strict=True)
-        ]
+        world = [transformed_by(pose, points) for (points, _), pose in zip(parts, self._poses, strict=True)]
         raised = [np.isin(classes, GROUND_CLASSES, invert=True) for _, classes in parts]
         for k, (points, classes) in enumerate(parts):
             # An object is static if it is where it is in a scan a third of the window earlier or later.
@@ -233,8 +231,8 @@ class Window:
         for surfaces, twist, pose in zip(self._surfaces, self.twists, self._poses, strict=True):
             share = turned(surfaces.azimuths, start_rad) - 0.5
             points = compensate_sweep(surfaces.points, fraction * self.period_s * share, twist)
-            world = points @ pose[:3, :3].T + pose[:3, 3]
-            # A tree of few queries: built faster than it is balanced.
+            world = transformed_by(pose, points)
+            # For few queries: balancing it takes longer than they do.
             posed.append(_PosedScan(points, cKDTree(world, balanced_tree=False, compact_nodes=False), twist))
         count = len(self._poses)
         self._matches = [
@@ -339,9 +337,7 @@ class Window:
             points, own = posed[scan].points.take(index, axis=0), sign * (normals @ R)
             of_poses[:, at : at + 3] = cross(points.T, own.T).T
             of_poses[:, at + 3 : at + 6] = own
-            rate = (
-                np.ascontiguousarray(cross(posed[scan].twist[:3, None], points.T).T) + posed[scan].twist[3:]
-            )
+            rate = cross_rows(posed[scan].twist[:3], points) + posed[scan].twist[3:]
             per_turn = self.period_s * np.einsum("ij,ij->i", own, rate)
             surfaces = self._surfaces[scan]
             of_times[:, 0] += per_turn * surfaces.behind[index]
@@ -417,19 +413,14 @@ def _of_every_direction(normals: FloatArray, most: int) -> IndexArray:
     number = np.mod(np.arctan2(normals[:, 1], normals[:, 0]), np.pi) / np.pi * _DIRECTIONS
     upright = np.minimum(number.astype(np.intp), _DIRECTIONS - 1)
     direction = np.where(np.abs(normals[:, 2]) > _LEVEL, _DIRECTIONS, upright)
-    return np.concatenate([_spread(direction == k, most) for k in range(_DIRECTIONS + 1)])
+    along = [np.flatnonzero(direction == k) for k in range(_DIRECTIONS + 1)]
+    return np.concatenate([spread_places(places, most) for places in along])
 
 
 _LEVEL = 0.8
 """A surface whose normal's height is more than this is level."""
 _DIRECTIONS = 12
 """Directions of normals in the horizontal plane that are distinguished."""
-
-
-def _spread(chosen: NDArray[np.bool_], most: int) -> IndexArray:
-    """At most so many of the places where an array is True, evenly spread."""
-    found = np.flatnonzero(chosen)
-    return found if len(found) <= most else found[np.linspace(0, len(found) - 1, most).astype(np.intp)]
 
 
 def _groups(cells: IndexArray) -> tuple[IndexArray, IndexArray]:

@@ -75,7 +75,7 @@ def shade(view: View, mesh: Mesh, faces: IndexArray, depth: FloatArray, look: Lo
     """(h, w, 3) float BGR light of faces (h, w) of ``mesh`` at depth z (h, w) [m], no blur or noise."""
     seen, index = compact(faces)
     if seen[0] < 0:
-        # The sky borrows any face; it is painted over below.
+        # Pixels of the sky get any face; they are painted over below.
         seen = np.concatenate([[0], seen[1:]])
     part = mesh.part(seen)
     ground = faces >= 0

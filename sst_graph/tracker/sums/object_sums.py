@@ -116,7 +116,7 @@ class ObjectSums:
         self.closed = T @ self.closed @ T.T
 
     def close(self, seen: Container[int], information: FloatArray, naive: FloatArray, point: Point) -> None:
-        """Drop the objects that are not ``seen`` any more, but keep their jackknife steps in the sums.
+        """Drop the objects that are not ``seen``, but keep their jackknife steps in the sums.
 
         Args:
             information, naive: (n, n) of everything, and its inverse.

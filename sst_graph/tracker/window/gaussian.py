@@ -249,10 +249,6 @@ class Gaussian:
         information = T @ H[:, x]
         return Gaussian(point, 0.5 * (information + information.T), T @ self.vector), T
 
-    def core(self) -> Gaussian:
-        """On [extrinsic, offset, biases, parameters] alone, the objects' biases marginalized out."""
-        return self.without(self.point.tracks)[0] if self.point.tracks else self
-
     def transition(self, variances: FloatArray) -> FloatArray:
         """A (n, n) = (I + information Q)^-1 of a random walk, Q = diag(variances (m,), 0): the rest stays."""
         Q = np.zeros(len(self.vector))

@@ -24,6 +24,7 @@ from sst_graph.graph.matching import (
     associate,
 )
 from sst_graph.graph.outer_loop import KERNELS_PX
+from sst_graph.odometry.cloud import transformed_points
 from sst_graph.tracker.by_edges.kinds import EDGE_KERNEL_SHARE, by_edges, by_labels, of_kind
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.sums.held import held_names
@@ -154,7 +155,7 @@ class WindowMatcher:
                 if c in contours and not (
                     c == SemanticClass.OBJECT and part.have_labels(pair.scan, pair.image)
                 ):
-                    cPs = points.lPs @ point.cTl.rotation().matrix().T + point.cTl.translation()
+                    cPs = transformed_points(point.cTl, points.lPs)
                     inside = points.objects[part.camera.in_image(part.camera.project(cPs))]
                     seen = np.bincount(inside) if len(inside) else np.zeros(0, np.intp)
                     tracks = self.window.tracks[number]

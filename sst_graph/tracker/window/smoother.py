@@ -146,7 +146,7 @@ class WindowSmoother:
 
         Args:
             found: new matches by scan.
-            dropped: scans that no longer have a match: they are removed, and not added to ``past``.
+            dropped: scans that have no match now: they are removed, and not added to ``past``.
             first_scan: the window's first scan.
             alive: tracks of objects that may be seen again; the biases of all others are marginalized out
                 as soon as no pair of the window sees them.

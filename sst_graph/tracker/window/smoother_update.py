@@ -149,7 +149,7 @@ class SmootherUpdate:
             self.sums.transform(T)
 
     def _close_objects(self) -> None:
-        """Objects that are gone for good are no longer kept one by one."""
+        """Objects that cannot be seen again are not kept one by one."""
         kept = {
             track
             for entry in self.entries.values()
@@ -213,7 +213,7 @@ class SmootherUpdate:
         return new.number
 
     def _close_epochs(self) -> None:
-        """Epochs that no pair of the window sees any more go into the past."""
+        """Epochs of which the window has no pair go into the past."""
         while len(self.epochs) > 1 and all(e.epoch > self.epochs[0].number for e in self.entries.values()):
             if self.epochs[1].links is None:
                 break

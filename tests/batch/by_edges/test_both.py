@@ -24,13 +24,13 @@ from sst_graph.batch.problem import CalibrationProblem, MatchedDrives
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
+from sst_graph.experiments.starts import errors_of
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.fit import EDGES_QUALITY, FitQuality
 from sst_graph.graph.matching import edges_of, match_all
 from sst_graph.graph.outer_loop import JointSolution, solve_joint
 from sst_graph.graph.state import EXTRINSIC, State, difference, time_offset_key
 from sst_graph.inspect.verdict import fit_line, quality_line
-from sst_graph.metrics import calibration_errors
 from sst_graph.report import ReportInputs, report_html
 from sst_graph.simulator import SimulationConfig
 from sst_graph.types import Frame, Guess, SemanticClass
@@ -362,7 +362,7 @@ def test_a_street_with_labels_in_every_second_frame() -> None:
     assert drive.truth is not None
     result = calibrate(drive, drive.truth.cTl.retract(AWAY), CalibrationConfig(method="both"))
     assert result.method == "both" and result.status == "ok"
-    errors = calibration_errors(result.T_camera_lidar, result.time_offset_s, drive.truth, result.covariance)
+    errors = errors_of(result, drive.truth)
     assert errors.qad_deg < 0.2 and errors.atd_m < 0.03
     assert errors.nees is not None and errors.nees.joint < 2.5 * 7
     said = result.diagnostics["both"]
@@ -389,7 +389,7 @@ def test_frames_with_pictures_of_another_street_are_left_out() -> None:
     result = calibrate(drive, drive.truth.cTl.retract(AWAY), CalibrationConfig(method="both"))
     # Labels in eight frames, by themselves: not wrong, if less sure.
     assert result.status != "not_converged"
-    errors = calibration_errors(result.T_camera_lidar, result.time_offset_s, drive.truth, result.covariance)
+    errors = errors_of(result, drive.truth)
     assert errors.nees is not None and errors.nees.joint < 2.5 * 7
     assert any(reason.startswith("edges were left out: ") for reason in result.reasons)
     assert all(used.frame % 2 == 0 for used in result.frames_used)

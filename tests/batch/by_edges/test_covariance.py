@@ -34,7 +34,7 @@ from sst_graph.simulator import SimulationConfig
 from sst_graph.stepwise import run_to_end
 from sst_graph.types import Guess, SemanticClass
 from studies.edges_poor_scenes import SCENES, START, drive_through
-from studies.edges_streets import source_of, start_step
+from studies.edges_streets import error_of, source_of, start_step
 
 STREET = SimulationConfig(seed=504, frames=3, motion="no_stop", azimuth_limit_deg=50.0, width=621, height=188)
 
@@ -155,8 +155,7 @@ def test_an_estimate_that_comes_back_is_trusted() -> None:
     result = calibrate(street, start, CalibrationConfig(method="edges"))
     assert np.degrees(np.linalg.norm(result.diagnostics["spread"]["farther_edges"][:3])) > 0.1
     assert result.status == "ok"
-    late = result.time_offset_s - street.truth.time_offset_s
-    error = np.append(street.truth.cTl.localCoordinates(result.T_camera_lidar), late)
+    error = error_of(result.calibration, street.truth)
     assert error @ np.linalg.solve(result.covariance, error) < 7.0
 
 

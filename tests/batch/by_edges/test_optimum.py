@@ -14,8 +14,8 @@ from sst_graph.batch.by_edges.optimum import shifted, toward_motion
 from sst_graph.batch.by_edges.problem import EdgesProblem, LabelEstimate, edges_problem
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.batch.problem import CalibrationProblem
+from sst_graph.experiments.starts import errors_of
 from sst_graph.graph.state import State, difference
-from sst_graph.metrics import calibration_errors
 from sst_graph.simulator import SimulationConfig
 from sst_graph.types import Guess
 
@@ -78,6 +78,6 @@ def test_false_optima_are_left(street: SimulationConfig, guessed: bool) -> None:
     """They lie 1.2 deg and 14 cm away, met with a guess, and 24 cm away, met without; both were ok."""
     drive = simulated(street)
     result = calibrate(drive, drive.nominal if guessed else None, CalibrationConfig(method="edges"))
-    errors = calibration_errors(result.T_camera_lidar, result.time_offset_s, drive.truth, result.covariance)
+    errors = errors_of(result, drive.truth)
     assert errors.qad_deg < 0.3 and errors.atd_m < 0.03
     assert errors.nees is not None and errors.nees.joint < 14.0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from bisect import bisect_left
 
-import gtsam
 import numpy as np
 
 from sst_graph.data.frame_parts import RecentReader, scan_positions
@@ -12,7 +11,7 @@ from sst_graph.odometry.lidar import LidarOdometry
 from sst_graph.types import FloatArray, RelativeMotion
 
 
-class DriveMotion:
+class DriveOdometry:
     """LiDAR odometry that goes along as frames are asked for; each scan is registered once."""
 
     def __init__(self, drive: RecentReader) -> None:
@@ -20,7 +19,6 @@ class DriveMotion:
         self._positions = scan_positions(drive.source)
         self._odometry = LidarOdometry()
         self._motions: list[RelativeMotion | None] = []
-        self._oTls = [gtsam.Pose3()]
 
     def l_twist(self, position: int) -> FloatArray | None:
         """(6,) twist of the LiDAR [rad/s, m/s] at the scan of a position; None where it is unknown."""
@@ -30,17 +28,8 @@ class DriveMotion:
         twists = [motion.mean_twist for motion in around if motion is not None and motion.ok]
         return np.asarray(np.mean(twists, axis=0)) if twists else None
 
-    def oTl(self, position: int) -> gtsam.Pose3:
-        """Pose of the LiDAR at the scan of a position, in that of the first scan."""
-        at = bisect_left(self._positions, position)
-        self._go_to(at)
-        return self._oTls[min(at, len(self._oTls) - 1)]
-
     def _go_to(self, at: int) -> None:
         """Register the scans up to number ``at``: motion k leads to scan k, motion 0 to nothing."""
         while len(self._motions) <= min(at, len(self._positions) - 1):
             scan = self._drive.scan(self._positions[len(self._motions)])
-            motion = None if scan is None else self._odometry.add(scan)
-            if self._motions:
-                self._oTls.append(self._oTls[-1] * motion.aTb if motion is not None else self._oTls[-1])
-            self._motions.append(motion)
+            self._motions.append(None if scan is None else self._odometry.add(scan))
