@@ -108,11 +108,20 @@ def checked_frame(frame: object, place: str = "frame") -> Frame:
     """
     if not isinstance(frame, Frame):
         raise DataError(place, f"a {type(frame).__name__}", "a Frame")
-    if not isinstance(frame.index, int | np.integer) or isinstance(frame.index, bool):
-        raise DataError(place, f"an index that is a {type(frame.index).__name__}", "a whole number")
-    if abs(int(frame.index)) > LATEST_NS:
+    return Frame(checked_index(frame.index, place), frame.scan, frame.image)
+
+
+def checked_index(index: object, place: str = "frame") -> int:
+    """The number of a frame in its drive as a plain int.
+
+    Raises:
+        DataError: it is no whole number, or one that does not fit into int64.
+    """
+    if not isinstance(index, int | np.integer) or isinstance(index, bool):
+        raise DataError(place, f"an index that is a {type(index).__name__}", "a whole number")
+    if abs(int(index)) > LATEST_NS:
         raise DataError(place, "an index of more than 19 digits", "a number of a frame")
-    return Frame(int(frame.index), frame.scan, frame.image)
+    return int(index)
 
 
 def checked_intrinsics(camera: object, place: str = "camera") -> PinholeCamera:

@@ -17,6 +17,7 @@ import gtsam
 from ..arguments import checked_type
 from ..errors import FactorError
 from .factor import FactorRecipe, recipe_of
+from .stored_noise import StoredNoise, stored_noise
 from .variables import checked_key
 
 
@@ -97,6 +98,10 @@ class PackedGraph:
             kinds = (FactorRecipe, gtsam.NonlinearFactor, type(None))
             checked_type("factors of PackedGraph", each, kinds, expected)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """For copies and pickles: each factor, and its noise where gtsam would not store that whole."""
+        return _packed, tuple((each, _noise_apart(each)) for each in self.factors)
+
     @staticmethod
     def of(graph: gtsam.NonlinearFactorGraph) -> PackedGraph:
         """Pack a graph.
@@ -118,6 +123,24 @@ class PackedGraph:
             if each is not None:
                 graph.replace(i, each.build() if isinstance(each, FactorRecipe) else each)
         return graph
+
+
+def _noise_apart(factor: Any) -> StoredNoise | None:
+    """The noise of a factor of gtsam's own, where it is to be stored in parts."""
+    if not isinstance(factor, gtsam.NonlinearFactor) or not hasattr(factor, "noiseModel"):
+        return None
+    stored = stored_noise(factor.noiseModel())
+    return stored if isinstance(stored, StoredNoise) else None
+
+
+def _packed(*factors: tuple[Any, StoredNoise | None]) -> PackedGraph:
+    """A packed graph that was stored."""
+    return PackedGraph(
+        tuple(
+            each if noise is None else each.cloneWithNewNoiseModel(noise.restored())
+            for each, noise in factors
+        )
+    )
 
 
 def checked_graph(what: str, graph: Any) -> None:

@@ -20,6 +20,7 @@ import numpy as np
 
 from ..arguments import FloatArray, as_numbers, checked_count, checked_type, described, other_signature
 from ..errors import FactorError, count_of
+from .stored_noise import restored_noise, stored_noise
 from .variables import Kind, Reader, checked_key, checked_keys, dimension, key_name
 
 Jacobians = Sequence[FloatArray] | None
@@ -67,6 +68,13 @@ class FactorRecipe:
         if not callable(self.function):
             raise FactorError(f"function of {name}", described(self.function), "a function")
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """For copies and pickles."""
+        return _recipe, (
+            stored_noise(self.noise),
+            *(self.keys, self.function, self.dims, self.rows, self.name),
+        )
+
     def build(self) -> gtsam.CustomFactor:
         """A new factor."""
         readers = [
@@ -96,6 +104,11 @@ class FactorRecipe:
             return error
 
         return gtsam.CustomFactor(self.noise, keys, callback)
+
+
+def _recipe(noise: Any, *others: Any) -> FactorRecipe:
+    """A recipe that was stored."""
+    return FactorRecipe(restored_noise(noise), *others)
 
 
 _REQUEST: ContextVar[list[FactorRecipe] | None] = ContextVar("recipe", default=None)

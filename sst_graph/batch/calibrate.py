@@ -57,6 +57,7 @@ from sst_graph.drive.preparation import (
     prepare_drive,
 )
 from sst_graph.errors import ConfigError, EstimationError
+from sst_graph.floating_point import with_usual_errors
 from sst_graph.marginal import MOST_SCAN_HASHES, SCAN_HASHES
 from sst_graph.odometry.sweep import with_sweep
 from sst_graph.result import CalibrationResult
@@ -64,6 +65,7 @@ from sst_graph.types import Guess, Source
 from sst_graph.validation import checked_guess
 
 
+@with_usual_errors
 def calibrate(
     frames: Source | Sequence[Source],
     initial: gtsam.Pose3 | None = None,
@@ -134,6 +136,7 @@ def preparation_of(config: CalibrationConfig) -> PrepareConfig:
     return prepare
 
 
+@with_usual_errors
 def calibrate_prepared(
     drives: Sequence[Drive],
     initial: gtsam.Pose3 | None = None,

@@ -57,6 +57,11 @@ _EVERY = 2
 """One of so many contour pixels is evaluated: neighbours show the same."""
 
 
+_MOST_SHARE, _ALWAYS = 0.1, 2_000
+"""A mask is noise, and no outline of anything, where more than this share of its pixels is evaluated along
+contours, and more than so many."""
+
+
 @dataclass(frozen=True)
 class PictureEdges:
     """What the picture shows at each pixel of a mask's contours, in the order of :func:`contour_pixels`.
@@ -100,8 +105,8 @@ def find_picture_edges(
     distance: FloatMap,
     picture: Picture,
     outside: NDArray[np.uint8] | None,
-) -> PictureEdges:
-    """What the picture shows along the contours of a region.
+) -> PictureEdges | None:
+    """What the picture shows along the contours of a region; None where they fill it, as in noise.
 
     Args:
         inside: (h, w) 1 in the region, 0 elsewhere.
@@ -109,8 +114,10 @@ def find_picture_edges(
         picture: (h, w, 3) BGR.
         outside: (h, w) 1 beside pixels that the lens does not show: a contour is not moved there.
     """
-    along = _ALONG_PX // _EVERY
-    pixels, own = _closed(contour_pixels(inside), 3 * along)
+    along, outlines = _ALONG_PX // _EVERY, contour_pixels(inside)
+    if sum(map(len, outlines)) > max(_ALWAYS, _MOST_SHARE * inside.size):
+        return None
+    pixels, own = _closed(outlines, 3 * along)
     ts = np.arange(-_REACH_PX, _REACH_PX + 1e-9, _STEP_PX)
     strength = _strength(pixels, ts, distance, picture, along)
     likely = strength * np.exp(-0.5 * (ts / _MASK_SIGMA_PX) ** 2).astype(np.float32)[:, None]

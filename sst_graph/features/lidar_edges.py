@@ -48,6 +48,8 @@ _CELL_M = 0.3
 """Grid cell for splitting a class into objects where instances are missing [m]."""
 MAX_RANGE_M = 60.0
 """Range beyond which objects are not used [m]: their labels are poor, and few returns outline them."""
+_OFF_AXIS_M = 1e-3
+"""Points nearer to the z axis have no azimuth [m]; no laser of a scanner that turns measures along it."""
 _MIN_POINTS = 15
 """Objects with fewer returns are not used: their edges are those of a few beams."""
 
@@ -123,6 +125,8 @@ def find_boundaries(
     """
     points = scan.points.astype(np.float64)
     apart = np.einsum("ij,ij->i", points, points) > 0.25
+    # On the axis of rotation there is no azimuth.
+    apart &= np.abs(points[:, :2]).max(axis=1) > _OFF_AXIS_M
     usable = slice(None) if apart.all() else apart
     points, labels = points[usable], scan.classes[usable]
     # Compared with plain ints: compared with an enum, all labels are converted to int64.

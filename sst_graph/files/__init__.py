@@ -27,7 +27,7 @@ from sst_graph.files.output import (
     atomic_write_text,
     output_file,
 )
-from sst_graph.files.staging import abandon_all, when_safe
+from sst_graph.files.staging import abandon_all, sweep_folder, when_safe
 from sst_graph.files.targets import TEXT, OutputFileKind, check_file_target, check_folder_target
 
 __all__ = [
@@ -44,5 +44,6 @@ __all__ = [
     "check_file_target",
     "check_folder_target",
     "output_file",
+    "sweep_folder",
     "when_safe",
 ]

@@ -7,6 +7,7 @@ import fcntl
 import hashlib
 import json
 import os
+import re
 import secrets
 import shutil
 import socket
@@ -35,6 +36,9 @@ EXCHANGE = "exchange"
 
 _LONGEST_NAME = 180
 """Bytes of a name that are kept in the staging folder's; file systems allow 255 in all."""
+
+_UNFINISHED = re.compile(rf"\.(.+)\.[0-9a-f]{{16}}{re.escape(SUFFIX)}", re.DOTALL)
+"""Name of an unfinished file, or of a staging folder on its way, with that of its target."""
 
 _ATTEMPTS = 20
 """Tries to take a name while others clean up there; each try fails only if another process made progress."""
@@ -168,7 +172,7 @@ def lock_file(descriptor: int) -> bool:
 
 
 def _claimed(target: Path, made: list[Path]) -> Stage:
-    _sweep(target)
+    sweep_folder(target.parent, _short(target))
     path = target.with_name(_staging_name(target))
     for _ in range(_ATTEMPTS):
         fresh = _fresh_name(target)
@@ -201,17 +205,18 @@ def _locked_folder(path: Path) -> int:
     return lock
 
 
-def _sweep(target: Path) -> None:
-    """Remove unfinished files and folders of ``target`` whose process is gone."""
-    start, own = f".{_short(target)}.", _staging_name(target)
-    with os.scandir(target.parent) as entries:
-        names = [entry.name for entry in entries]
-    for name in names:
-        if name.startswith(start) and name.endswith(SUFFIX) and name != own:
-            middle = name[len(start) : -len(SUFFIX)]
-            if len(middle) == 16 and set(middle) <= set("0123456789abcdef"):
-                with suppress(OSError, ConfigError):
-                    _clear(target.with_name(name), target)
+def sweep_folder(folder: Path, short: str | None = None) -> None:
+    """Remove what killed runs left unfinished in a folder of many files; what a living process writes stays.
+
+    Args:
+        short: of one target only, by its name as it is kept; None: of all.
+    """
+    with os.scandir(folder) as entries:
+        found = [_UNFINISHED.fullmatch(entry.name) for entry in entries]
+    for one in filter(None, found):
+        if short in (None, one[1]):
+            with suppress(OSError, ConfigError):
+                _clear(folder / one[0], folder / one[1])
 
 
 def _clear(path: Path, target: Path) -> None:

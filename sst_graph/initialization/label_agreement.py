@@ -28,8 +28,11 @@ CELLS = (10, 32)
 
 _WRONG_LABELS = 0.1
 """Share of labels that are no better than chance: a vote against a pose is never below its logarithm."""
-_BATCH_POINTS = 400_000
-"""Points, times poses, that are projected at once: some megabytes an array."""
+_STEP_POINTS = 400_000
+"""Points, times poses, that are projected in a step."""
+_BATCH_POINTS = 100_000
+"""The same at once: arrays fit into a core's cache, and products are small enough that BLAS, where it may use
+several threads, takes one. Both make a step several times faster."""
 
 
 @dataclass(frozen=True)
@@ -109,10 +112,13 @@ class AgreementMap:
 
     def score_steps(self, states: States) -> Stepwise[FloatArray]:
         """(m,) scores of poses, some of them a step."""
-        chunk = max(1, _BATCH_POINTS // max(1, len(self.lPs)))
+        step, batch = (max(1, most // max(1, len(self.lPs))) for most in (_STEP_POINTS, _BATCH_POINTS))
         scores = []
-        for start in range(0, len(states), chunk):
-            scores.append(self._score(states.take(slice(start, start + chunk))))
+        for first in range(0, len(states), step):
+            some = states.take(slice(first, first + step))
+            scores += [
+                self._score(some.take(slice(start, start + batch))) for start in range(0, len(some), batch)
+            ]
             yield 2
         return np.concatenate(scores)
 

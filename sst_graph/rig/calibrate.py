@@ -31,6 +31,7 @@ from sst_graph.drive.preparation import Drive, Progress, check_progress
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.factors.arguments import checked_type
 from sst_graph.fit import QUALITY, Fit
+from sst_graph.floating_point import with_usual_errors
 from sst_graph.graph.outer_loop import KERNELS_PX
 from sst_graph.graph.state import State
 from sst_graph.quality.fit_of_solution import has_edges
@@ -53,6 +54,7 @@ from sst_graph.validation import checked_guess
 CameraSources = Source | Sequence[Source]
 
 
+@with_usual_errors
 def calibrate_rig(
     cameras: Mapping[str, CameraSources],
     initial: Mapping[str, gtsam.Pose3 | None] | None = None,
@@ -108,6 +110,7 @@ def prepare_rig(
     return drives
 
 
+@with_usual_errors
 def calibrate_rig_prepared(
     drives: Mapping[str, Sequence[Drive]],
     guesses: Mapping[str, Guess],

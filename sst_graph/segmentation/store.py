@@ -36,7 +36,7 @@ from sst_graph.classes import (
 from sst_graph.data.arrays import listed, read_labels
 from sst_graph.data.images import read_instances, read_mask
 from sst_graph.errors import ConfigError, DataError, count_of
-from sst_graph.files import atomic_write_bytes, atomic_write_text
+from sst_graph.files import atomic_write_bytes, atomic_write_text, sweep_folder
 from sst_graph.files.reading import FileKind, read_json
 from sst_graph.segmentation.segmenter import ImageLabels, PointLabels, Segmenter
 from sst_graph.types import CameraImage, Scan, SemanticClass, intensities_of
@@ -105,13 +105,14 @@ class LabelStore:
         return models[0] if models else None
 
     def enter(self, side: Side, segmenter: Segmenter) -> StoredModel:
-        """Make a place for the labels of a network."""
+        """Make a place for the labels of a network; what a killed run left half-written there is removed."""
         model = StoredModel(segmenter.name, segmenter.identity, segmenter.known)
         path = self._place(side, model.identity) / _MODEL_FILE
         if not path.exists():
             known = sorted(one.name.lower() for one in model.known)
             content = {"format": FORMAT, "version": VERSION, "name": model.name, "identity": model.identity}
             atomic_write_text(path, json.dumps({**content, "classes": known}, indent=1) + "\n")
+        sweep_folder(path.parent)
         return model
 
     def image(self, model: str, image: CameraImage) -> ImageLabels | None:

@@ -14,6 +14,7 @@ from sst_graph.drive.stamp_intervals import Jump
 from sst_graph.errors import DataError, EstimationError
 from sst_graph.factors.arguments import checked_count, checked_type
 from sst_graph.factors.camera import PinholeCamera
+from sst_graph.floating_point import with_usual_errors
 from sst_graph.marginal import inverse
 from sst_graph.odometry.sweep import SweepDecision
 from sst_graph.result import UNNAMED_CAMERA, CalibrationResult
@@ -38,7 +39,7 @@ from sst_graph.tracker.storage.snapshot import Snapshot
 from sst_graph.tracker.track_update import Sensor, TrackUpdate, current_update, make_update
 from sst_graph.tracker.window.matcher import WindowMatcher
 from sst_graph.types import CameraImage, Frame, Scan
-from sst_graph.validation import checked_frame, checked_guess, checked_intrinsics
+from sst_graph.validation import checked_frame, checked_guess, checked_index, checked_intrinsics
 
 _LOG = logging.getLogger(__name__)
 
@@ -111,6 +112,7 @@ class Tracker:
         assert update is not None
         return update
 
+    @with_usual_errors
     def add_scan(self, scan: Scan, frame: int | None = None) -> TrackUpdate:
         """Add a scan, and estimate; where anything fails, everything is as it was.
 
@@ -118,7 +120,8 @@ class Tracker:
             frame: its number in the drive, by which the result names it; None: scans are counted.
         """
         try:
-            # 1. Check the scan and its stamp.
+            # 1. Check the scan, its number and its stamp.
+            frame = None if frame is None else checked_index(frame)
             checked, clock_step_ns = self.inputs.check_scan(scan)
             with Snapshot(self):
                 # 2. Its boundary points, and the motion that led to it, go into the window.
@@ -142,6 +145,7 @@ class Tracker:
         except Exception as error:
             return self._not_added("scan", scan, error)
 
+    @with_usual_errors
     def optimize(self, max_iterations: int = 20) -> TrackUpdate:
         """Solve the whole window as the batch does, as at the end of a drive.
 
@@ -163,10 +167,12 @@ class Tracker:
             self.monitor.check_start_at_end(self.estimate)
         return dataclasses.replace(current_update(self, self.last_update), converged=converged)
 
+    @with_usual_errors
     def result(self, drive: str = "stream", camera_name: str = UNNAMED_CAMERA) -> CalibrationResult:
         """The present estimate as a calibration result; the frames used are those of the window."""
         return tracker_result(self, drive, camera_name)
 
+    @with_usual_errors
     def marginal(self, since: TrackedMarginal | None = None) -> TrackedMarginal:
         """The marginal on extrinsic and time offset, as a factor for a graph of your own.
 
@@ -202,6 +208,7 @@ class Tracker:
             )
         return increment(whole, since)
 
+    @with_usual_errors
     def save(self, path: str | Path) -> None:
         """Write a checkpoint; a file that exists is replaced in one step.
 
@@ -215,6 +222,7 @@ class Tracker:
             saver.save(self)
 
     @staticmethod
+    @with_usual_errors
     def load(path: str | Path, setup: Setup | None = None, sweep: SweepDecision | None = None) -> Tracker:
         """The tracker in a checkpoint, at the estimate it was saved with.
 
@@ -232,6 +240,7 @@ class Tracker:
 
     # ------------------------------------------------------------------ steps
 
+    @with_usual_errors
     def _use_image(self, image: CameraImage, with_update: bool) -> TrackUpdate | None:
         """Add an image; the update, which one that was used has only where it is asked for."""
         try:

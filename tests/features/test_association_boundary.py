@@ -179,6 +179,17 @@ def test_rays_leave_the_tip_of_their_ring() -> None:
     np.testing.assert_allclose(slopes, np.tan(ELEVATIONS[np.radians(1.0) > ELEVATIONS]), atol=1e-4)
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("height_m", [-2.0, 3.0])
+def test_points_on_the_axis_of_rotation_are_left_out(height_m: float) -> None:
+    scan = scene()
+    points, plain = scan.points.copy(), found_in(scan)
+    some = np.flatnonzero(scan.classes == VEHICLE)[[3, 40, 41]]
+    points[some] = 0.0, 0.0, height_m
+    found = found_in(replace(scan, points=points))
+    assert 0.8 * len(plain) < len(found) and np.hypot(*found.lPs[:, :2].T).min() > 9.0
+
+
 def test_no_edge_across_a_gap_in_the_scan() -> None:
     scan = scene()
     azimuth, _, _ = polar_deg(scan.points)

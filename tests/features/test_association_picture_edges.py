@@ -169,3 +169,20 @@ def test_a_very_long_contour() -> None:
     found = field(stripes, pixels)
     assert found.edges is not None and len(found.edges.shifts) > 70_000
     assert np.median(np.abs(found.edges.shifts)) < 0.1 and found.edges.seen.all()
+
+
+@pytest.mark.parametrize("kind", ["board", "noise"])
+def test_a_mask_of_noise_does_not_follow_the_picture(kind: str) -> None:
+    """Every pixel lies on a contour: evaluated all along, a picture of 1242x375 px would take gigabytes."""
+    rng = np.random.default_rng(0)
+    board = np.indices((HEIGHT, WIDTH)).sum(axis=0) % 2
+    labels = {"board": board, "noise": rng.integers(0, 2, (HEIGHT, WIDTH))}[kind].astype(np.uint8)
+    found = field(labels, picture())
+    assert found.edges is None
+    np.testing.assert_array_equal(found.distance, field(labels).distance)
+
+
+def test_a_few_wrong_pixels_are_no_noise() -> None:
+    labels = mask()
+    labels[np.random.default_rng(0).random(labels.shape) < 0.003] = VEHICLE
+    assert field(labels, picture()).edges is not None

@@ -27,6 +27,7 @@ from sst_graph.files import (
     check_file_target,
     check_folder_target,
     output_file,
+    sweep_folder,
 )
 from sst_graph.files.manifest import carry_over, give_back
 
@@ -412,3 +413,19 @@ def test_long_and_strange_names_are_fine(tmp_path: Path) -> None:
             write(tmp_path / name, {"a": text}, overwrite=True)
         assert tree(tmp_path / name) == {"a": "new"}
     assert len(names(tmp_path)) == 5
+
+
+def test_a_folder_of_many_files_is_swept(tmp_path: Path) -> None:
+    """What a living process writes there stays, and what only looks like it."""
+    left, living = (tmp_path / f".{name}.png.{16 * name}.sst-graph-partial" for name in "ab")
+    others = [
+        tmp_path / name for name in ("a.png", ".a.png.sst-graph-partial", ".a.png.zz.sst-graph-partial")
+    ]
+    for path in (left, living, *others):
+        path.write_bytes(b"half")
+    with open(living, "rb") as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        sweep_folder(tmp_path)
+        assert sorted(tmp_path.iterdir()) == sorted([living, *others])
+    sweep_folder(tmp_path)
+    assert sorted(tmp_path.iterdir()) == sorted(others)

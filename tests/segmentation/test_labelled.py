@@ -153,6 +153,15 @@ def test_all_classes_and_instances_come_back_from_disk(tmp_path: Path) -> None:
     assert store.image("a" * 64, changed) is None
 
 
+def test_what_a_killed_run_left_is_removed(tmp_path: Path) -> None:
+    first = image_of(with_labels(drive_of(), Threshold(100), None, tmp_path), 0)
+    path = next(tmp_path.glob("images/*/*.png"))
+    left = path.with_name(f".{path.name}.0123456789abcdef.sst-graph-partial")
+    left.write_bytes(path.read_bytes()[:30])
+    again = image_of(with_labels(drive_of(), Threshold(100), None, tmp_path), 0)
+    assert not left.exists() and (again.mask == first.mask).all()
+
+
 def test_a_damaged_file_is_made_again_or_named(tmp_path: Path) -> None:
     segmenter = Threshold(100)
     first = image_of(with_labels(drive_of(), segmenter, None, tmp_path), 0)

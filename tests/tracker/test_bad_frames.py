@@ -168,6 +168,29 @@ def test_a_frame_may_be_anything(running: Path) -> None:
     assert stored(tracker) == before
 
 
+def test_a_scan_s_number_is_one(running: Path, frames: list[Frame]) -> None:
+    """Else the result could not be written, nor a checkpoint read."""
+    tracker = Tracker.load(running)
+    before, scan = stored(tracker), frames[14].scan
+    assert scan is not None
+    for number in ("a", 1.5, True, np.zeros(2), 2**80, 10**5000):
+        update = tracker.add_scan(scan, number)  # type: ignore[arg-type]
+        assert update.refused == ("scan",) and "frame: found an index" in update.reason
+    assert stored(tracker) == before
+    assert not tracker.add_scan(scan, np.int64(14)).refused  # type: ignore[arg-type]
+
+
+def test_what_a_program_has_set_for_floating_point_errors_does_not_count(
+    running: Path, frames: list[Frame]
+) -> None:
+    usual, strict = Tracker.load(running), Tracker.load(running)
+    for frame in frames[14:18]:
+        expected = usual.add(frame)
+        with np.errstate(all="raise"):
+            update = strict.add(frame)
+        assert update.to_dict() == expected.to_dict()
+
+
 def test_one_sensor_s_data_are_refused_and_the_other_s_are_taken(running: Path, frames: list[Frame]) -> None:
     tracker, good = Tracker.load(running), frames[14]
     assert good.image is not None

@@ -200,8 +200,9 @@ class ChangeDetector:
         """
         pairs = self.matcher.pairs_at(estimate.point, sorted(estimate.scans), _KERNEL)
         out = set(moving)
+        scores = {scan: self._scores({scan: pair}, estimate, out) for scan, pair in pairs.items()}
         while True:
-            value, scans = self._largest_of_parts(pairs, estimate, out)
+            value, scans = self._largest_of_parts(scores, estimate)
             if value <= threshold:
                 return value
             part = {scan: pairs[scan] for scan in scans}
@@ -209,14 +210,23 @@ class ChangeDetector:
             if odd is None:
                 return value
             out.add(odd)
+            for scan, pair in pairs.items():
+                if odd in self.matcher.tracks_of({scan: pair}):
+                    scores[scan] = self._scores({scan: pair}, estimate, out)
+
+    def _scores(
+        self, pairs: Mapping[int, PairMatches], estimate: ComparedEstimate, out: Collection[int]
+    ) -> list[LinearizedPair]:
+        """Scores of frames at an estimate, without some objects; none where all matches are left out."""
+        return self.matcher.linearized(pairs, estimate.point, out)
 
     def _largest_of_parts(
-        self, pairs: Mapping[int, PairMatches], estimate: ComparedEstimate, out: Collection[int]
+        self, scores: Mapping[int, Sequence[LinearizedPair]], estimate: ComparedEstimate
     ) -> tuple[float, list[int]]:
-        """The largest statistic of a part of the frames, and the part's scans; 0 and none without any."""
-        scores = [(scan, self.matcher.linearized({scan: pairs[scan]}, estimate.point, out)) for scan in pairs]
+        """The largest statistic of a part of the frames, by scores of each scan, and the part's scans; 0 and
+        none without any."""
         # A scan whose matches are all left out has no score.
-        scored = [scan for scan, own in scores if own]
+        scored = [scan for scan, own in scores.items() if own]
         n = len(scored)
         cuts = range(2, n - 1)
         parts = {
@@ -225,7 +235,7 @@ class ChangeDetector:
             *((k, k + FRAMES) for k in range(n - FRAMES + 1)),
         }
         value, (first, end) = self.statistic.largest_of_parts(
-            [score for _, own in scores for score in own], sorted(parts), estimate
+            [score for own in scores.values() for score in own], sorted(parts), estimate
         )
         return value, scored[first:end]
 
@@ -243,7 +253,7 @@ class ChangeDetector:
         tried = steps(estimate.point.cTl, DETECTABLE_TURN_RAD, DETECTABLE_OFFSET_S)
 
         def compared(*without: int) -> Comparison | None:
-            scores = self.matcher.linearized(pairs, estimate.point, {*without, *out})
+            scores = self._scores(pairs, estimate, {*without, *out})
             return self.statistic.compare(scores, estimate) if scores else None
 
         whole = compared()

@@ -17,6 +17,7 @@ from sst_graph.factors import (
     PackedGraph,
     clone_factor,
     clone_graph,
+    custom_factor,
     recipe_of,
     rekeyed,
     time_offset_prior,
@@ -117,3 +118,42 @@ def test_other_keys_are_distinct():
     for new_keys in ({1: 2}, {1: 3, 2: 3}):
         with pytest.raises(FactorError, match="distinct keys"):
             rekeyed(between, new_keys)
+
+
+KERNELS = ["Huber", "Cauchy", "Tukey", "AsymmetricTukey", "GemanMcClure", "Welsch", "DCS"]
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("nested", [False, True])
+def test_a_robust_kernel_comes_back_as_it_was(kernel, nested):
+    """gtsam loses half of Tukey's."""
+    noise = gtsam.noiseModel.Isotropic.Sigma(6, 0.5)
+    noise = gtsam.noiseModel.Robust.Create(getattr(gtsam.noiseModel.mEstimator, kernel).Create(20.0), noise)
+    if nested:
+        noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(30.0), noise)
+
+    def function(pose, jacobians):
+        return gtsam.Pose3.Logmap(pose), [np.eye(6)]
+
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph.add(custom_factor(noise, [E], function, [6], 6))
+    graph.add(gtsam.PriorFactorPose3(E, gtsam.Pose3(), noise))
+    values.insert(E, gtsam.Pose3(gtsam.Rot3(), np.array([3.0, 1.0, -2.0])))
+    packed = copy.deepcopy(PackedGraph.of(graph))
+    for other in (clone_graph(graph), packed.unpack(), copy.deepcopy(packed).unpack()):
+        for k in range(2):
+            assert other.at(k).error(values) == graph.at(k).error(values)
+            np.testing.assert_array_equal(
+                other.at(k).linearize(values).augmentedJacobian(),
+                graph.at(k).linearize(values).augmentedJacobian(),
+            )
+
+
+def test_a_kernel_that_gtsam_cannot_store_is_named():
+    estimator = gtsam.noiseModel.mEstimator
+    kernel = estimator.Custom(lambda d: 1.0, lambda d: d * d, estimator.Base.ReweightScheme.Block, "own")
+    noise = gtsam.noiseModel.Robust.Create(kernel, gtsam.noiseModel.Unit.Create(6))
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(gtsam.PriorFactorPose3(E, gtsam.Pose3(), noise))
+    with pytest.raises(FactorError, match="expected a kernel that gtsam can store"):
+        pickle.dumps(PackedGraph.of(graph))
