@@ -8,14 +8,14 @@ step: those beyond the kernel are gone.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from sst_graph.batch.part_solver import Part, PartSolver, SolvedPart
-from sst_graph.covariance.contradiction import Difference, combined, name_step
+from sst_graph.covariance.contradiction import Difference, PartEstimate, combined, name_step
 from sst_graph.graph.state import State
 
 FALSE_ALARM = 1e-3
@@ -64,8 +64,8 @@ def find_contradictions(parts: PartSolver) -> Contradictions:
     steps = [step for of_drive in stretches if (step := _within(parts, of_drive, false_alarm)) is not None]
     sentences = [_step_sentence(parts, step) for step in steps]
     # 3. Each drive against the others.
-    against = _between(parts, stretches)
-    apart = {n: d for n, d in against.items() if d.p_value * len(against) < false_alarm}
+    solved, own_offsets = _whole_drives(parts, stretches), len(parts.reference.time_offsets_s) > 1
+    against, apart = _between(solved, own_offsets), _apart(solved, own_offsets, false_alarm)
     sentences += [_drive_sentence(parts, number, difference) for number, difference in apart.items()]
     diagnostics = {
         "within": [_step_document(parts, step) for step in steps],
@@ -213,8 +213,8 @@ _SECOND_STEP = 0.1
 """A second step back must raise what agrees with the two estimates by this share."""
 
 
-def _between(parts: PartSolver, stretches: Sequence[Sequence[SolvedPart]]) -> dict[int, Difference]:
-    """Each drive against the others together, by the drive's number; drives without estimate are left out."""
+def _whole_drives(parts: PartSolver, stretches: Sequence[Sequence[SolvedPart]]) -> dict[int, PartEstimate]:
+    """Of several drives each one's own estimate, by its number; drives without one are left out."""
     if len(parts.drives) < 2:
         return {}
     solved = {}
@@ -223,7 +223,11 @@ def _between(parts: PartSolver, stretches: Sequence[Sequence[SolvedPart]]) -> di
         part = parts.solve_from(whole, parts.best_start(whole, [s.state for s in own]))
         if part is not None:
             solved[number] = part.step
-    own_offsets = len(parts.reference.time_offsets_s) > 1
+    return solved
+
+
+def _between(solved: Mapping[int, PartEstimate], own_offsets: bool) -> dict[int, Difference]:
+    """Each drive against the others together, by the drive's number."""
     # Of two, the second stands for both.
     compared = [*solved][1:] if len(solved) <= 2 else [*solved]
     return {
@@ -232,6 +236,25 @@ def _between(parts: PartSolver, stretches: Sequence[Sequence[SolvedPart]]) -> di
         )
         for number in compared
     }
+
+
+def _apart(
+    solved: Mapping[int, PartEstimate], own_offsets: bool, false_alarm: float
+) -> dict[int, Difference]:
+    """The drives that contradict the others, the worst one first.
+
+    One that is wrong draws the mean of the others away from each that is right: it is left out before these
+    are compared.
+    """
+    left, found = dict(solved), dict[int, Difference]()
+    while len(left) > 1:
+        against = _between(left, own_offsets)
+        worst = max(against, key=lambda number: against[number].chi2)
+        if against[worst].p_value * len(against) >= false_alarm:
+            break
+        found[worst] = against[worst]
+        del left[worst]
+    return found
 
 
 def _step_sentence(parts: PartSolver, step: Step) -> str:
