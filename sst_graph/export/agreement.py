@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.special import chdtrc
 
 from sst_graph.covariance.contradiction import Difference, PartEstimate, combined, name_step
 from sst_graph.errors import ContradictionError, EstimationError, count_of
-from sst_graph.graph.linear import unit_scale
+from sst_graph.graph.linear import scaled_inverse, unit_scale
 from sst_graph.marginal import CalibrationMarginal, Separated
 from sst_graph.types import FloatArray
 
@@ -46,12 +47,9 @@ def check_agreement(
     _check_answers([part.own.information for part in parts], names)
     estimates = [_estimate(part) for part in parts]
     # 1. All together: how much the costs are above their own minima, for 7 numbers a part more than needed.
-    chi2, freedom = _disagreement(parts, estimates), 7 * (len(parts) - 1)
-    # 2. Each against the others.
-    against = [
-        Difference.of(combined([*estimates[:k], *estimates[k + 1 :]]), part)
-        for k, part in enumerate(estimates)
-    ]
+    chi2, freedom = disagreement(estimates), 7 * (len(parts) - 1)
+    # 2. Each against the others: what it adds to all of that.
+    against = [against_others(estimates, k) for k in range(len(estimates))]
     worst = int(np.argmax([difference.chi2 for difference in against]))
     p_value = min(float(chdtrc(freedom, chi2)), len(parts) * against[worst].p_value)
     if 2.0 * p_value < significance:
@@ -105,19 +103,56 @@ def _estimate(part: Separated) -> PartEstimate:
     return PartEstimate(covariance @ part.own.vector, covariance, common=part.errors)
 
 
-def _disagreement(parts: Sequence[Separated], estimates: Sequence[PartEstimate]) -> float:
-    """Chi-squared of all estimates d_k = x + S_k a + own error, with common errors a of one deviation each.
+@dataclass(frozen=True)
+class _Joint:
+    """Estimates d_k = x + S_k a + own error, with common errors a of one deviation each, solved together.
 
     The least over x and a of sum (d_k - x - S_k a)' L_k (d_k - x - S_k a) + a' a.
+
+    Attributes:
+        names: of the common errors.
+        mean, covariance: (7 + c,) of x and a, and (7 + c, 7 + c).
+        disagreement: the least: chi-squared of the estimates.
     """
-    names = list(dict.fromkeys(name for part in parts for name in part.errors))
-    around = combined(estimates).step
-    H = np.diag([0.0] * 7 + [1.0] * len(names))
-    g, constant = np.zeros(len(H)), 0.0
-    for part, estimate in zip(parts, estimates, strict=True):
-        J = np.column_stack([np.eye(7), *(estimate.shift(name) for name in names)])
-        d, L = estimate.step - around, part.own.information
-        H, g, constant = H + J.T @ L @ J, g + J.T @ L @ d, constant + float(d @ L @ d)
-    scale = unit_scale(H)
-    least = np.linalg.lstsq(H * np.outer(scale, scale), g * scale, rcond=None)[0]
-    return constant - float(g @ (scale * least))
+
+    names: Sequence[str]
+    mean: FloatArray
+    covariance: FloatArray
+    disagreement: float
+
+    @classmethod
+    def of(cls, estimates: Sequence[PartEstimate]) -> _Joint:
+        names = list(dict.fromkeys(name for each in estimates for name in each.common))
+        around = combined(estimates).step
+        H = np.diag([0.0] * 7 + [1.0] * len(names))
+        g, constant = np.zeros(len(H)), 0.0
+        for each in estimates:
+            J, d, L = _design(each, names), each.step - around, np.linalg.inv(each.covariance)
+            H, g, constant = H + J.T @ L @ J, g + J.T @ L @ d, constant + float(d @ L @ d)
+        covariance = scaled_inverse(H)
+        least = covariance @ g
+        mean = least + np.concatenate([around, np.zeros(len(names))])
+        return cls(names, mean, covariance, constant - float(g @ least))
+
+
+def disagreement(estimates: Sequence[PartEstimate]) -> float:
+    """Chi-squared of estimates together, with the common errors that explain them best."""
+    return _Joint.of(estimates).disagreement
+
+
+def _design(estimate: PartEstimate, names: Sequence[str]) -> FloatArray:
+    """(7, 7 + c) derivative of an estimate by x and the common errors."""
+    return np.column_stack([np.eye(7), *(estimate.shift(name) for name in names)])
+
+
+def against_others(estimates: Sequence[PartEstimate], k: int) -> Difference:
+    """From what the others say of an estimate, with what they tell of the common errors, to the estimate.
+
+    Its chi-squared is that of all estimates together less that of the others.
+    """
+    one, others = estimates[k], _Joint.of([*estimates[:k], *estimates[k + 1 :]])
+    J = _design(one, others.names)
+    new = [name for name in one.common if name not in others.names]
+    apart = np.reshape([one.shift(name) for name in new], (-1, 7))
+    covariance = one.covariance + J @ others.covariance @ J.T + apart.T @ apart
+    return Difference(one.step - J @ others.mean, covariance)

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sst_graph.covariance.contradiction import PartEstimate
 from sst_graph.errors import ContradictionError, DataError, EstimationError
 from sst_graph.export import CalibrationMarginal, Common, common_errors, fuse_marginals, marginal_of_result
+from sst_graph.export.agreement import against_others, disagreement
 from sst_graph.factors import FactorError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.marginal import carried, separated
@@ -169,3 +171,21 @@ def test_refuses_what_is_no_part_of_it() -> None:
     nothing = CalibrationMarginal(TRUE, 0.0, np.diag([1.0] * 6 + [0.0]), np.zeros(7))
     with pytest.raises(EstimationError):
         replace(nothing, common=Common({"cx": np.full(7, 1e-3)}))
+
+
+def test_what_a_drive_adds_to_the_disagreement_names_the_wrong_one() -> None:
+    """Among drives that are known unequally well, and that a lens moves unequally far."""
+    rng, wrong = np.random.default_rng(0), 1
+    for _ in range(100):
+        lens, estimates = rng.normal(size=len(LENS)), []
+        for k in range(3):
+            A = rng.normal(size=(7, 20)) * SIGMAS[:, None] * rng.uniform(0.3, 3.0)
+            common = {name: 2.0 * step * rng.uniform(0.5, 1.5, 7) for name, step in LENS.items()}
+            step = rng.multivariate_normal(np.zeros(7), A @ A.T / 20.0)
+            step = step + lens @ np.array([*common.values()])
+            step[rng.integers(3)] += np.radians(1.0) * (k == wrong)
+            estimates.append(PartEstimate(step, A @ A.T / 20.0, common=common))
+        against = [against_others(estimates, k) for k in range(3)]
+        assert int(np.argmax([difference.chi2 for difference in against])) == wrong
+        rest = disagreement([estimates[0], estimates[2]])
+        np.testing.assert_allclose(against[wrong].chi2, disagreement(estimates) - rest, rtol=1e-6)
