@@ -126,7 +126,7 @@ def find_boundaries(
     points = scan.points.astype(np.float64)
     apart = np.einsum("ij,ij->i", points, points) > 0.25
     # On the axis of rotation there is no azimuth.
-    apart &= np.abs(points[:, :2]).max(axis=1) > _OFF_AXIS_M
+    apart &= (np.abs(points[:, 0]) > _OFF_AXIS_M) | (np.abs(points[:, 1]) > _OFF_AXIS_M)
     usable = slice(None) if apart.all() else apart
     points, labels = points[usable], scan.classes[usable]
     # Compared with plain ints: compared with an enum, all labels are converted to int64.
