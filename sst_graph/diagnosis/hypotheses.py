@@ -76,15 +76,17 @@ def _best(
     """Quality, higher where the labels agree just there, and cause of the best change that is accepted; none
     is tried after one of ``enough``."""
     base = Fit(gtsam.Pose3(), 0.0, 0.0, 0.0) if given is None else given
+    given_quality = base.quality * (THERE_GAIN if _is_there(base, guess) else 1.0)
     best: tuple[float, Finding] | None = None
     for hypothesis in tried:
         found = fit(hypothesis.drive, hypothesis.guess)
         if found is None:
             continue
-        quality = _quality(found, hypothesis.guess)
-        if quality == found.quality and found.concentration < LEAST_CONCENTRATION:
+        there = _is_there(found, hypothesis.guess)
+        quality = found.quality * (THERE_GAIN if there else 1.0)
+        if not there and found.concentration < LEAST_CONCENTRATION:
             continue
-        if quality < max(LEAST_QUALITY, LEAST_GAIN * _quality(base, guess)):
+        if quality < max(LEAST_QUALITY, LEAST_GAIN * given_quality):
             continue
         if found.explained < LEAST_EXPLAINED_GAIN * base.explained:
             continue
@@ -104,12 +106,11 @@ def _best(
     return best
 
 
-def _quality(found: Fit, guess: Guess) -> float:
-    """Quality of a fit, higher where the labels agree just at its guess."""
+def _is_there(found: Fit, guess: Guess) -> bool:
+    """Whether the labels agree just where a guess says."""
     if guess.cTl is None:
-        return found.quality
-    far_deg = quaternion_angle_deg(guess.cTl.rotation(), found.cTl.rotation())
-    return THERE_GAIN * found.quality if far_deg < THERE_DEG else found.quality
+        return False
+    return quaternion_angle_deg(guess.cTl.rotation(), found.cTl.rotation()) < THERE_DEG
 
 
 def _shifts(drive: Drive, guess: Guess) -> Iterator[Hypothesis]:

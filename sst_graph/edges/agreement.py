@@ -23,7 +23,7 @@ from sst_graph.features.picture_gradients import (
 )
 from sst_graph.graph.matching import DriveEdges
 from sst_graph.graph.state import State
-from sst_graph.odometry.cloud import transformed_points
+from sst_graph.points import transformed_points
 from sst_graph.types import FloatArray, IntArray
 
 FloatMap = NDArray[np.float32]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -103,46 +102,12 @@ def _estimate(part: Separated) -> PartEstimate:
     return PartEstimate(covariance @ part.own.vector, covariance, common=part.errors)
 
 
-@dataclass(frozen=True)
-class _Joint:
-    """Estimates d_k = x + S_k a + own error, with common errors a of one deviation each, solved together.
+def disagreement(estimates: Sequence[PartEstimate]) -> float:
+    """Chi-squared of estimates d_k = x + S_k a + own error, with common errors a of one deviation each.
 
     The least over x and a of sum (d_k - x - S_k a)' L_k (d_k - x - S_k a) + a' a.
-
-    Attributes:
-        names: of the common errors.
-        mean, covariance: (7 + c,) of x and a, and (7 + c, 7 + c).
-        disagreement: the least: chi-squared of the estimates.
     """
-
-    names: Sequence[str]
-    mean: FloatArray
-    covariance: FloatArray
-    disagreement: float
-
-    @classmethod
-    def of(cls, estimates: Sequence[PartEstimate]) -> _Joint:
-        names = list(dict.fromkeys(name for each in estimates for name in each.common))
-        around = combined(estimates).step
-        H = np.diag([0.0] * 7 + [1.0] * len(names))
-        g, constant = np.zeros(len(H)), 0.0
-        for each in estimates:
-            J, d, L = _design(each, names), each.step - around, np.linalg.inv(each.covariance)
-            H, g, constant = H + J.T @ L @ J, g + J.T @ L @ d, constant + float(d @ L @ d)
-        covariance = scaled_inverse(H)
-        least = covariance @ g
-        mean = least + np.concatenate([around, np.zeros(len(names))])
-        return cls(names, mean, covariance, constant - float(g @ least))
-
-
-def disagreement(estimates: Sequence[PartEstimate]) -> float:
-    """Chi-squared of estimates together, with the common errors that explain them best."""
-    return _Joint.of(estimates).disagreement
-
-
-def _design(estimate: PartEstimate, names: Sequence[str]) -> FloatArray:
-    """(7, 7 + c) derivative of an estimate by x and the common errors."""
-    return np.column_stack([np.eye(7), *(estimate.shift(name) for name in names)])
+    return _joint(estimates, _names(estimates))[2]
 
 
 def against_others(estimates: Sequence[PartEstimate], k: int) -> Difference:
@@ -150,9 +115,31 @@ def against_others(estimates: Sequence[PartEstimate], k: int) -> Difference:
 
     Its chi-squared is that of all estimates together less that of the others.
     """
-    one, others = estimates[k], _Joint.of([*estimates[:k], *estimates[k + 1 :]])
-    J = _design(one, others.names)
-    new = [name for name in one.common if name not in others.names]
-    apart = np.reshape([one.shift(name) for name in new], (-1, 7))
-    covariance = one.covariance + J @ others.covariance @ J.T + apart.T @ apart
-    return Difference(one.step - J @ others.mean, covariance)
+    one, names = estimates[k], _names(estimates)
+    mean, covariance, _ = _joint([*estimates[:k], *estimates[k + 1 :]], names)
+    J = _design(one, names)
+    return Difference(one.step - J @ mean, one.covariance + J @ covariance @ J.T)
+
+
+def _joint(estimates: Sequence[PartEstimate], names: Sequence[str]) -> tuple[FloatArray, FloatArray, float]:
+    """Mean (7 + c,) and covariance of x and the common errors of some names, and the least cost; an error
+    that no estimate has keeps its one deviation."""
+    around = combined(estimates).step
+    H = np.diag([0.0] * 7 + [1.0] * len(names))
+    g, constant = np.zeros(len(H)), 0.0
+    for each in estimates:
+        J, d, L = _design(each, names), each.step - around, np.linalg.inv(each.covariance)
+        H, g, constant = H + J.T @ L @ J, g + J.T @ L @ d, constant + float(d @ L @ d)
+    covariance = scaled_inverse(H)
+    least = covariance @ g
+    mean = least + np.concatenate([around, np.zeros(len(names))])
+    return mean, covariance, constant - float(g @ least)
+
+
+def _names(estimates: Sequence[PartEstimate]) -> list[str]:
+    return list(dict.fromkeys(name for each in estimates for name in each.common))
+
+
+def _design(estimate: PartEstimate, names: Sequence[str]) -> FloatArray:
+    """(7, 7 + c) derivative of an estimate by x and the common errors."""
+    return np.column_stack([np.eye(7), *(estimate.shift(name) for name in names)])

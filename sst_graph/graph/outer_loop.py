@@ -310,14 +310,14 @@ def concentration(solution: JointSolution, problem: JointProblem) -> float:
     pose that was fitted to some contours are spread over all distances.
     """
     edges = edges_of(problem.drives, problem.motions, problem.config.graph)
-    close, all_ = (
+    close, wide = (
         _support(
             match_all(edges, solution.state, RobustKernel("geman_mcclure", scale * KERNELS_PX[-1])),
             solution.state,
         )
         for scale in CONCENTRATION_SCALES
     )
-    return close / max(all_, 1e-9)
+    return close / max(wide, 1e-9)
 
 
 def explained(solution: JointSolution) -> float:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sst_graph.drive.preparation import ScanFeatures
-from sst_graph.odometry.cloud import transformed_points
 from sst_graph.odometry.lidar import GROUND_CLASSES, TESTED_CLASSES
+from sst_graph.points import transformed_points
 from sst_graph.sampling import step_for
 from sst_graph.types import FloatArray, SemanticClass
 

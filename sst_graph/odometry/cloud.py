@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gtsam
 import numpy as np
 import small_gicp
 from numpy.typing import NDArray
@@ -36,16 +35,6 @@ def compensate_sweep(points: FloatArray, offsets_s: FloatArray, twist: FloatArra
 
 FEWEST_POINTS = 11
 """That small_gicp registers without a warning of its own on stderr."""
-
-
-def transformed_points(aTb: gtsam.Pose3, bPs: FloatArray) -> FloatArray:
-    """(n, 3) points of frame b in frame a; ``transformFrom`` flattens a batch of one."""
-    return np.asarray(bPs @ aTb.rotation().matrix().T + aTb.translation())
-
-
-def transformed_by(aTb: FloatArray, bPs: FloatArray) -> FloatArray:
-    """:func:`transformed_points` by a (4, 4) matrix."""
-    return np.asarray(bPs @ aTb[:3, :3].T + aTb[:3, 3])
 
 
 def usable_points(
@@ -137,9 +126,8 @@ def _neighbours(points: FloatArray, tree: small_gicp.KdTree, fewest: int) -> int
     if len(points) < _MORE_NEIGHBOURS:
         return fewest
     sample = points[:: max(1, len(points) // _SAMPLE)]
-    near = points[np.asarray(tree.batch_knn_search(sample, fewest)[0], np.intp)]
-    near -= near.mean(axis=1, keepdims=True)
-    variances = np.linalg.eigvalsh(near.transpose(0, 2, 1) @ near)
+    near = np.asarray(tree.batch_knn_search(sample, fewest)[0], np.intp)
+    variances = np.linalg.eigvalsh(scatter(points, near))
     lines = np.mean(variances[:, 1] < _LINE_RATIO * variances[:, 2])
     return max(fewest, _MORE_NEIGHBOURS) if lines > _MOST_LINES else fewest
 
@@ -152,3 +140,13 @@ _LINE_RATIO, _MOST_LINES = 0.05, 0.25
 """Neighbours lie on a line where their second variance is less than this ratio of their first; at most this
 share of the neighbourhoods may. Of six neighbours each, 4 to 11 % do with 64 and 128 rings, 27 to 32 % with
 32 rings 1.3 deg apart. More neighbours for all would make the motions of 64 rings 1.5 times worse."""
+
+
+def scatter(points: FloatArray, near: NDArray[np.intp]) -> FloatArray:
+    """(m, 3, 3) sums of the squared deviations of k points each from their mean, near (m, k) among points
+    (n, 3): axis by axis, which is many times faster."""
+    rows = np.ascontiguousarray(near.T)
+    each = [column.take(rows) for column in np.ascontiguousarray(points.T)]
+    around = [column - column.mean(axis=0) for column in each]
+    sums = [(a * b).sum(axis=0) for a in around for b in around]
+    return np.stack(sums, axis=1).reshape(-1, 3, 3)

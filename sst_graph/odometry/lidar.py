@@ -19,11 +19,11 @@ from sst_graph.odometry.cloud import (
     compensate_sweep,
     registration_cloud,
     surfaces,
-    transformed_by,
     usable_points,
 )
 from sst_graph.odometry.local_map import LocalMap, MappedCloud
 from sst_graph.odometry.static_points import StaticPoints
+from sst_graph.points import transformed_by
 from sst_graph.types import FloatArray, RelativeMotion, Scan, SemanticClass
 
 MOVABLE_CLASSES = (SemanticClass.VEHICLE, SemanticClass.PERSON, SemanticClass.TWO_WHEELER)
@@ -191,10 +191,11 @@ class LidarOdometry:
         if min(last.size(), cloud.size()) < FEWEST_POINTS:
             return wTl
         tree = small_gicp.KdTree(last)
+        predicted = np.linalg.inv(wTlast) @ wTl
         best, least = wTl, np.inf
         for shift in _shifts():
-            start = np.linalg.inv(wTlast) @ wTl
-            start[:3, 3] += start[:3, :3] @ shift
+            start = predicted.copy()
+            start[:3, 3] += predicted[:3, :3] @ shift
             result = small_gicp.align(
                 last,
                 cloud,

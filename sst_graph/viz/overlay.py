@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.mask_contour import ContourMap
-from sst_graph.odometry.cloud import transformed_points
+from sst_graph.points import transformed_points
 from sst_graph.types import Calibration, CameraImage, FloatArray, Frame, Scan, SemanticClass
 
 Picture = NDArray[np.uint8]

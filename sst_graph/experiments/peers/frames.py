@@ -15,7 +15,7 @@ from sst_graph.drive.preparation import Drive
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.lidar_beams import arrange_beams
-from sst_graph.odometry.cloud import transformed_points
+from sst_graph.points import transformed_points
 from sst_graph.sampling import evenly_spread
 from sst_graph.types import (
     CameraImage,

@@ -24,7 +24,7 @@ from sst_graph.graph.matching import (
     associate,
 )
 from sst_graph.graph.outer_loop import KERNELS_PX
-from sst_graph.odometry.cloud import transformed_points
+from sst_graph.points import transformed_points
 from sst_graph.tracker.by_edges.kinds import EDGE_KERNEL_SHARE, by_edges, by_labels, of_kind
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.sums.held import held_names
