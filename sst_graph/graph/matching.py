@@ -42,7 +42,7 @@ from sst_graph.graph.nuisances import deviation_of, moved_twists, residual_colum
 from sst_graph.graph.state import State, lower_edge_track
 from sst_graph.objects.dynamic_objects import dynamic_object_weights
 from sst_graph.objects.tracks import numbers_in, of_each
-from sst_graph.sampling import step_for
+from sst_graph.sampling import spread_places, step_for
 from sst_graph.types import Calibration, FloatArray, IntArray, SemanticClass
 
 
@@ -97,6 +97,10 @@ stamps vary by."""
 DYNAMIC_REACH_M = 0.003
 """A dynamic object whose unknown motion between its scan and its image is this long keeps half of its weight;
 one that moves a little farther keeps none [m]: a quarter of a pixel at 10 m with KITTI's camera."""
+
+MOST_POINTS = 100_000
+"""Most boundary points that are matched. Neighbours on an outline share its errors: beyond some hundred frames
+more of them say nothing new."""
 
 
 @dataclass(frozen=True)
@@ -214,8 +218,11 @@ class DriveEdges:
         return np.repeat(np.arange(len(self.scans)), np.diff(self.bounds))
 
     def thinned(self, most: int) -> DriveEdges:
-        """Evenly spread points, at most so many."""
-        index = np.arange(0, len(self), step_for(len(self), most))
+        """Every second (third, ...) point: at most so many."""
+        return self.take(np.arange(0, len(self), step_for(len(self), most)))
+
+    def take(self, index: IntArray) -> DriveEdges:
+        """Some of the points, by position, rising."""
         return replace(
             self,
             points=self.points.take(index),
@@ -570,12 +577,21 @@ def _own_motion(
 def edges_of(
     drives: Sequence[Drive], motions: Sequence[DriveMotion], config: GraphConfig
 ) -> list[DriveEdges]:
-    """The boundary points of drives, to be matched again and again; drives without any are left out."""
+    """The boundary points of drives, to be matched again and again; drives without any are left out.
+
+    Of more than :data:`MOST_POINTS` in all so many are left, so that memory and time do not grow without end
+    with the drives.
+    """
     found = [
-        DriveEdges.of(number, drive, motion, config)
+        edges
         for number, (drive, motion) in enumerate(zip(drives, motions, strict=True))
+        if (edges := DriveEdges.of(number, drive, motion, config)) is not None
     ]
-    return [edges for edges in found if edges is not None]
+    total = sum(map(len, found))
+    if total <= MOST_POINTS:
+        return found
+    most = [max(1, MOST_POINTS * len(edges) // total) for edges in found]
+    return [edges.take(spread_places(np.arange(len(edges)), n)) for edges, n in zip(found, most, strict=True)]
 
 
 def match_all(edges: Sequence[DriveEdges], state: State, kernel: RobustKernel) -> list[DriveMatches]:

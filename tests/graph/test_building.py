@@ -12,7 +12,14 @@ from streets import prepared_street, standing_street
 from sst_graph.factors import RobustKernel
 from sst_graph.graph.building import PRIOR_ROTATION_SIGMA_RAD, joint_graph, state_from, tracked_objects
 from sst_graph.graph.drive_motion import motions_of
-from sst_graph.graph.matching import GraphConfig, PairMatches, associate, edges_of, match_all
+from sst_graph.graph.matching import (
+    MOST_POINTS,
+    GraphConfig,
+    PairMatches,
+    associate,
+    edges_of,
+    match_all,
+)
 from sst_graph.graph.state import EXTRINSIC, State, bias_key, object_bias_key, time_offset_key, twist_key
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.types import SemanticClass
@@ -70,6 +77,18 @@ def test_matches_know_their_boundary_points_beside_objects_of_unknown_speed() ->
         for c, found in pair.matches.items():
             points = drive.scans[pair.pair.scan].boundaries[c]
             np.testing.assert_array_equal(points.lPs[found.index], found.alignment.lPs)
+
+
+def test_of_long_drives_so_many_points_are_matched_spread_over_all_scans() -> None:
+    drive = prepared_street(0.0)
+    (one,) = edges_of([drive], motions_of([drive]), CONFIG)
+    copies = 2 * MOST_POINTS // len(one)
+    many = edges_of([drive] * copies, motions_of([drive]) * copies, CONFIG)
+    assert 0.99 * MOST_POINTS < sum(map(len, many)) <= MOST_POINTS
+    for edges in (many[0], many[-1]):
+        kept = np.diff(edges.bounds) / np.diff(one.bounds)
+        assert edges.scans == one.scans and kept.min() > 0.4 and kept.max() < 0.6
+        assert set(np.flatnonzero(np.bincount(one.owners) > 3)) <= set(edges.owners.tolist())
 
 
 @pytest.mark.parametrize("by_object", [False, True])
