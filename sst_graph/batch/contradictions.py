@@ -65,7 +65,7 @@ def find_contradictions(parts: PartSolver) -> Contradictions:
     sentences = [_step_sentence(parts, step) for step in steps]
     # 3. Each drive against the others.
     solved, own_offsets = _whole_drives(parts, stretches), len(parts.reference.time_offsets_s) > 1
-    against, apart = _between(solved, own_offsets), _apart(solved, own_offsets, false_alarm)
+    against, apart = compare_drives(solved, own_offsets, false_alarm)
     sentences += [_drive_sentence(parts, number, difference) for number, difference in apart.items()]
     diagnostics = {
         "within": [_step_document(parts, step) for step in steps],
@@ -230,31 +230,27 @@ def _between(solved: Mapping[int, PartEstimate], own_offsets: bool) -> dict[int,
     """Each drive against the others together, by the drive's number."""
     # Of two, the second stands for both.
     compared = [*solved][1:] if len(solved) <= 2 else [*solved]
+    others = {number: [solved[k] for k in solved if k != number] for number in compared}
     return {
-        number: Difference.of(
-            combined([solved[k] for k in solved if k != number]), solved[number], own_offsets
-        )
-        for number in compared
+        number: Difference.from_others(others[number], solved[number], own_offsets) for number in compared
     }
 
 
-def _apart(
+def compare_drives(
     solved: Mapping[int, PartEstimate], own_offsets: bool, false_alarm: float
-) -> dict[int, Difference]:
-    """The drives that contradict the others, the worst one first.
-
-    One that is wrong draws the mean of the others away from each that is right: it is left out before these
-    are compared.
-    """
-    left, found = dict(solved), dict[int, Difference]()
-    while len(left) > 1:
-        against = _between(left, own_offsets)
+) -> tuple[dict[int, Difference], dict[int, Difference]]:
+    """Each drive against the others, and of those that contradict these, the worst one first, the same
+    without the worse ones: one that is wrong draws what the others say away from each that is right."""
+    every = against = _between(solved, own_offsets)
+    left, apart = dict(solved), dict[int, Difference]()
+    while against:
         worst = max(against, key=lambda number: against[number].chi2)
         if against[worst].p_value * len(against) >= false_alarm:
             break
-        found[worst] = against[worst]
+        apart[worst] = against[worst]
         del left[worst]
-    return found
+        against = _between(left, own_offsets)
+    return every, apart
 
 
 def _step_sentence(parts: PartSolver, step: Step) -> str:

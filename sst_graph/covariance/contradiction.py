@@ -18,6 +18,7 @@ import gtsam
 import numpy as np
 from scipy.special import chdtrc, fdtrc
 
+from sst_graph.graph.linear import scaled_inverse
 from sst_graph.types import FloatArray
 
 _LEAST_FREEDOM = 4.0
@@ -75,24 +76,32 @@ class Difference:
 
     @classmethod
     def of(cls, one: PartEstimate, other: PartEstimate, own_offsets: bool = False) -> Difference:
-        """From one part to another that is independent of it but for what they have in common.
+        """From one part to another, as :meth:`from_others`."""
+        return cls.from_others([one], other, own_offsets)
 
-        The degrees of freedom are Welch's, along the step: those of the part that is known worse count most
-        (Nel and van der Merwe, A solution to the multivariate Behrens-Fisher problem, 1986).
+    @classmethod
+    def from_others(
+        cls, others: Sequence[PartEstimate], one: PartEstimate, own_offsets: bool = False
+    ) -> Difference:
+        """From what other parts say of one, with what they tell of the common errors, to that one.
+
+        All parts are independent but for what they have in common. Where the covariances are known, the
+        chi-squared is the :func:`disagreement` of all parts less that of the others. The degrees of freedom
+        are Welch's, along the step: those of the side that is known worse count most (Nel and van der Merwe,
+        A solution to the multivariate Behrens-Fisher problem, 1986).
 
         Args:
             own_offsets: each part has a time offset of its own: only the extrinsics are compared.
         """
-        n = 6 if own_offsets else 7
-        shifts = [other.shift(name) - one.shift(name) for name in _names(one, other)]
-        apart = np.reshape(shifts, (-1, 7))
-        step = (other.step - one.step)[:n]
-        covariance = (one.covariance + other.covariance + apart.T @ apart)[:n, :n]
+        n, names = 6 if own_offsets else 7, _names(*others, one)
+        mean, covariance, _ = _joint(others, names)
+        J = _design(one, names)[:n]
+        step, covariance = one.step[:n] - J @ mean, one.covariance[:n, :n] + J @ covariance @ J.T
         along = np.linalg.solve(covariance, step)
         total = max(float(along @ covariance @ along), 1e-300)
         freedom = sum(
-            (float(along @ part.covariance[:n, :n] @ along) / total) ** 2 / max(part.clusters - 1.0, 1.0)
-            for part in (one, other)
+            (float(along @ side.covariance[:n, :n] @ along) / total) ** 2 / max(side.clusters - 1.0, 1.0)
+            for side in (combined(others), one)
         )
         return cls(step, covariance, max(1.0 / freedom, _LEAST_FREEDOM) if freedom > 0.0 else np.inf)
 
@@ -132,6 +141,34 @@ def combined(parts: Sequence[PartEstimate]) -> PartEstimate:
 def _names(*parts: PartEstimate) -> list[str]:
     """Errors that parts have in common."""
     return list(dict.fromkeys(name for part in parts for name in part.common))
+
+
+def disagreement(estimates: Sequence[PartEstimate]) -> float:
+    """Chi-squared of estimates d_k = x + S_k a + own error, with common errors a of one deviation each.
+
+    The least over x and a of sum (d_k - x - S_k a)' L_k (d_k - x - S_k a) + a' a.
+    """
+    return _joint(estimates, _names(*estimates))[2]
+
+
+def _joint(estimates: Sequence[PartEstimate], names: Sequence[str]) -> tuple[FloatArray, FloatArray, float]:
+    """Mean (7 + c,) and covariance of x and the common errors of some names, and the least cost; an error
+    that no estimate has keeps its one deviation."""
+    around = combined(estimates).step
+    H = np.diag([0.0] * 7 + [1.0] * len(names))
+    g, constant = np.zeros(len(H)), 0.0
+    for each in estimates:
+        J, d, L = _design(each, names), each.step - around, np.linalg.inv(each.covariance)
+        H, g, constant = H + J.T @ L @ J, g + J.T @ L @ d, constant + float(d @ L @ d)
+    covariance = scaled_inverse(H)
+    least = covariance @ g
+    mean = least + np.concatenate([around, np.zeros(len(names))])
+    return mean, covariance, constant - float(g @ least)
+
+
+def _design(estimate: PartEstimate, names: Sequence[str]) -> FloatArray:
+    """(7, 7 + c) derivative of an estimate by x and the common errors."""
+    return np.column_stack([np.eye(7), *(estimate.shift(name) for name in names)])
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ import gtsam
 import numpy as np
 from scipy.special import chdtrc
 
-from sst_graph.covariance.contradiction import Difference, PartEstimate, combined, name_step
+from sst_graph.covariance.contradiction import Difference, PartEstimate, disagreement, name_step
 from sst_graph.errors import ContradictionError, EstimationError, count_of
-from sst_graph.graph.linear import scaled_inverse, unit_scale
+from sst_graph.graph.linear import unit_scale
 from sst_graph.marginal import CalibrationMarginal, Separated
 from sst_graph.types import FloatArray
 
@@ -48,7 +48,9 @@ def check_agreement(
     # 1. All together: how much the costs are above their own minima, for 7 numbers a part more than needed.
     chi2, freedom = disagreement(estimates), 7 * (len(parts) - 1)
     # 2. Each against the others: what it adds to all of that.
-    against = [against_others(estimates, k) for k in range(len(estimates))]
+    against = [
+        Difference.from_others([*estimates[:k], *estimates[k + 1 :]], one) for k, one in enumerate(estimates)
+    ]
     worst = int(np.argmax([difference.chi2 for difference in against]))
     p_value = min(float(chdtrc(freedom, chi2)), len(parts) * against[worst].p_value)
     if 2.0 * p_value < significance:
@@ -100,46 +102,3 @@ def _estimate(part: Separated) -> PartEstimate:
     """A marginal's own optimum; a direction that it does not determine has a large variance."""
     covariance = np.asarray(np.linalg.inv(part.own.information + np.eye(7) / _FAR_SIGMA**2), np.float64)
     return PartEstimate(covariance @ part.own.vector, covariance, common=part.errors)
-
-
-def disagreement(estimates: Sequence[PartEstimate]) -> float:
-    """Chi-squared of estimates d_k = x + S_k a + own error, with common errors a of one deviation each.
-
-    The least over x and a of sum (d_k - x - S_k a)' L_k (d_k - x - S_k a) + a' a.
-    """
-    return _joint(estimates, _names(estimates))[2]
-
-
-def against_others(estimates: Sequence[PartEstimate], k: int) -> Difference:
-    """From what the others say of an estimate, with what they tell of the common errors, to the estimate.
-
-    Its chi-squared is that of all estimates together less that of the others.
-    """
-    one, names = estimates[k], _names(estimates)
-    mean, covariance, _ = _joint([*estimates[:k], *estimates[k + 1 :]], names)
-    J = _design(one, names)
-    return Difference(one.step - J @ mean, one.covariance + J @ covariance @ J.T)
-
-
-def _joint(estimates: Sequence[PartEstimate], names: Sequence[str]) -> tuple[FloatArray, FloatArray, float]:
-    """Mean (7 + c,) and covariance of x and the common errors of some names, and the least cost; an error
-    that no estimate has keeps its one deviation."""
-    around = combined(estimates).step
-    H = np.diag([0.0] * 7 + [1.0] * len(names))
-    g, constant = np.zeros(len(H)), 0.0
-    for each in estimates:
-        J, d, L = _design(each, names), each.step - around, np.linalg.inv(each.covariance)
-        H, g, constant = H + J.T @ L @ J, g + J.T @ L @ d, constant + float(d @ L @ d)
-    covariance = scaled_inverse(H)
-    least = covariance @ g
-    mean = least + np.concatenate([around, np.zeros(len(names))])
-    return mean, covariance, constant - float(g @ least)
-
-
-def _names(estimates: Sequence[PartEstimate]) -> list[str]:
-    return list(dict.fromkeys(name for each in estimates for name in each.common))
-
-
-def _design(estimate: PartEstimate, names: Sequence[str]) -> FloatArray:
-    """(7, 7 + c) derivative of an estimate by x and the common errors."""
-    return np.column_stack([np.eye(7), *(estimate.shift(name) for name in names)])

@@ -99,8 +99,8 @@ DYNAMIC_REACH_M = 0.003
 one that moves a little farther keeps none [m]: a quarter of a pixel at 10 m with KITTI's camera."""
 
 MOST_POINTS = 100_000
-"""Most boundary points that are matched. Neighbours on an outline share its errors: beyond some hundred frames
-more of them say nothing new."""
+"""Most boundary points that are matched. Neighbours on an outline share its errors; 60 frames of KITTI have
+21,000 to 58,000."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from streets import TRACKED_STREET
 
 from sst_graph import CalibrationConfig, open_source
 from sst_graph.batch.calibrate import calibrate_prepared, prepare_drives
-from sst_graph.batch.contradictions import _apart, find_contradictions
+from sst_graph.batch.contradictions import compare_drives, find_contradictions
 from sst_graph.batch.motion_factor import MAX_DISAGREEMENT_CHI2, fuse_motion, with_motion
 from sst_graph.batch.part_solver import Part, PartSolver, SolvedPart
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
@@ -336,10 +336,11 @@ def test_only_the_drive_that_is_wrong_is_named() -> None:
     covariance = np.diag([*np.radians([0.02] * 3), *[0.003] * 3, 0.001]) ** 2
     steps = np.random.default_rng(0).multivariate_normal(np.zeros(7), covariance, 4)
     drives = {k: PartEstimate(step, covariance) for k, step in enumerate(steps)}
-    assert not _apart(drives, False, 1e-3)
+    every, apart = compare_drives(drives, False, 1e-3)
+    assert set(every) == set(drives) and not apart
     for wrong in ([2], [1, 3]):
         turned = {
             k: replace(one, step=one.step + np.radians(0.5 * (k + 1)) * np.eye(7)[0] * (k in wrong))
             for k, one in drives.items()
         }
-        assert sorted(_apart(turned, False, 1e-3)) == wrong
+        assert sorted(compare_drives(turned, False, 1e-3)[1]) == wrong

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sst_graph.covariance.contradiction import PartEstimate
+from sst_graph.covariance.contradiction import Difference, PartEstimate, disagreement
 from sst_graph.errors import ContradictionError, DataError, EstimationError
 from sst_graph.export import CalibrationMarginal, Common, common_errors, fuse_marginals, marginal_of_result
-from sst_graph.export.agreement import against_others, disagreement
 from sst_graph.factors import FactorError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.marginal import carried, separated
@@ -185,7 +184,9 @@ def test_what_a_drive_adds_to_the_disagreement_names_the_wrong_one() -> None:
             step = step + lens @ np.array([*common.values()])
             step[rng.integers(3)] += np.radians(1.0) * (k == wrong)
             estimates.append(PartEstimate(step, A @ A.T / 20.0, common=common))
-        against = [against_others(estimates, k) for k in range(3)]
+        against = [
+            Difference.from_others([*estimates[:k], *estimates[k + 1 :]], estimates[k]) for k in range(3)
+        ]
         assert int(np.argmax([difference.chi2 for difference in against])) == wrong
         rest = disagreement([estimates[0], estimates[2]])
         np.testing.assert_allclose(against[wrong].chi2, disagreement(estimates) - rest, rtol=1e-6)
