@@ -45,6 +45,14 @@ def lidar_pose_text(T_cloud_lidar: gtsam.Pose3) -> str:
     return f"{metres},{turned}" if angles.any() else metres
 
 
+def in_lidar_axes(scan: Scan, T_cloud_lidar: gtsam.Pose3) -> Scan:
+    """A scan moved to the LiDAR's axes. Lasers that its order shows are seen from there."""
+    R, t = T_cloud_lidar.rotation().matrix(), T_cloud_lidar.translation()
+    points = ((scan.points.astype(np.float64) - t) @ R).astype(np.float32)
+    by_order = rings_from_order(points)
+    return replace(scan, points=points, rings=scan.rings if by_order is None else by_order)
+
+
 class LidarFrameSource(ChangedSource):
     """A source whose clouds are moved to the LiDAR's axes as they are read; poses are of these axes."""
 
@@ -64,8 +72,5 @@ class LidarFrameSource(ChangedSource):
         return None if truth is None else replace(truth, cTl=truth.cTl * self.T_cloud_lidar)
 
     def changed_scan(self, scan: Scan) -> Scan:
-        """The scan in the LiDAR's axes. Lasers that its order shows are seen from there."""
-        R, t = self.T_cloud_lidar.rotation().matrix(), self.T_cloud_lidar.translation()
-        points = ((scan.points.astype(np.float64) - t) @ R).astype(np.float32)
-        by_order = rings_from_order(points)
-        return replace(scan, points=points, rings=scan.rings if by_order is None else by_order)
+        """The scan in the LiDAR's axes."""
+        return in_lidar_axes(scan, self.T_cloud_lidar)

@@ -11,6 +11,7 @@ import numpy as np
 
 from sst_graph.cameras import Rectification
 from sst_graph.classes import MaskEncoding
+from sst_graph.data.lidar_pose import in_lidar_axes, parse_lidar_pose
 from sst_graph.data.ros.bag import TF_MESSAGE
 from sst_graph.data.ros.camera_info import ImageGeometry, image_geometry
 from sst_graph.data.ros.frames import CloudReading, check_size, mask_classes, scan_of
@@ -60,6 +61,8 @@ class CalibrationNode:
         self.settings, self._config = settings, config or TrackerConfig()
         self._encoding = MaskEncoding(settings.label_encoding)
         self._reading = _reading(settings)
+        # None where the clouds are in the LiDAR's axes.
+        self._T_cloud_lidar = parse_lidar_pose(settings.lidar_pose) if settings.lidar_pose else None
         given = settings.init not in (INIT_TF, INIT_NONE)
         # A node has one camera, whose name in the data that the file was made of is another matter.
         self._given = load_initial(Path(settings.init), None) if given else None
@@ -277,6 +280,8 @@ class CalibrationNode:
         if not self.lidar.frame:
             return None, 0.0, "no cloud yet"
         oTl, why = self._transforms.pose(self.camera.frame, self.lidar.frame)
+        if oTl is not None and self._T_cloud_lidar is not None:
+            oTl = oTl * self._T_cloud_lidar
         return (None if oTl is None else geometry.extrinsic(oTl)), 0.0, why
 
     def _use(self, one: Waiting, now_ns: int) -> TrackUpdate | None:
@@ -299,6 +304,8 @@ class CalibrationNode:
         if not one.is_scan:
             return Frame(one.number, None, self._image(one, now_ns))
         scan = scan_of(one.content, one.stamp_ns, self.lidar.topic, self._reading)
+        if self._T_cloud_lidar is not None:
+            scan = in_lidar_axes(scan, self._T_cloud_lidar)
         return Frame(one.number, scan, None)
 
     def _image(self, one: Waiting, now_ns: int) -> CameraImage:
@@ -366,6 +373,8 @@ class CalibrationNode:
         # The frame of the images, which may be turned against that of the camera model.
         assert self._geometry is not None
         oTl = gtsam.Pose3(self._geometry.cRo, np.zeros(3)).inverse() * cTl
+        if self._T_cloud_lidar is not None:
+            oTl = oTl * self._T_cloud_lidar.inverse()  # The frame that the clouds' headers name.
         if self.settings.parent == "lidar":
             return self._make.transforms({(lidar, camera): oTl.inverse()}, update.stamp_ns)
         return self._make.transforms({(camera, lidar): oTl}, update.stamp_ns)

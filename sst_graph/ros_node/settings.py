@@ -39,6 +39,11 @@ class NodeSettings(Settings):
         doc="Times of the points: auto (those in the clouds), compensated, clockwise, counterclockwise.",
     )
     sweep_period_s: float = setting(0.1, at_least=0.001, at_most=60.0, doc="Duration of a turn.")
+    lidar_pose: str = setting(
+        "",
+        doc="T_cloud_lidar, as --lidar-pose: where the LiDAR is in the axes of the clouds, if these are not "
+        "its own.",
+    )
     publish: str = setting(
         "adopted",
         choices=("adopted", "latest", "none"),
@@ -61,6 +66,11 @@ class NodeSettings(Settings):
         for name in ("image_topic", "info_topic", "cloud_topic", "init"):
             if not getattr(self, name):
                 raise ConfigError(f"{name}: found an empty name, expected one")
+        if self.lidar_pose and self.sweep in TURNS:
+            raise ConfigError(
+                f"sweep: found {self.sweep} with a lidar_pose, with which times do not follow from azimuths "
+                "in the cloud; expected auto or compensated"
+            )
 
 
 def parameter_defaults() -> dict[str, Any]:

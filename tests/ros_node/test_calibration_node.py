@@ -129,6 +129,36 @@ def test_the_transform_is_the_calibration(bag: Any, config: TrackerConfig, plain
     assert plain[3].transforms is None
 
 
+def test_clouds_in_axes_of_the_vehicle(bag: Any, config: TrackerConfig) -> None:
+    """The LiDAR is found where it is in them, and /tf stays between the frames that the headers name."""
+    T_vehicle_lidar = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.02, -0.03, 0.4), np.array([1.4, 0.1, 1.7]))
+    R, t = T_vehicle_lidar.rotation().matrix(), T_vehicle_lidar.translation()
+    make, messages = Messages(), []
+    for topic, kind, now_ns, message in _messages(bag)[:FEW]:
+        if topic == CLOUD:
+            packed = np.array(message.data).reshape(-1, message.point_step)
+            points = np.ascontiguousarray(packed[:, :12]).view("<f4").astype(float)
+            packed[:, :12] = (points @ R.T + t).astype("<f4").view(np.uint8)
+            header = dataclasses.replace(message.header, frame_id="vehicle")
+            message = dataclasses.replace(message, header=header, data=packed.reshape(-1))
+        messages.append((topic, kind, now_ns, message))
+    pose = "1.4,0.1,1.7," + ",".join(f"{angle:.9f}" for angle in np.degrees([0.02, -0.03, 0.4]))
+    moved = CalibrationNode(dataclasses.replace(SETTINGS, publish="latest", lidar_pose=pose), config)
+    moved.add_transforms(make.transforms({(LIDAR_FRAME, "vehicle"): T_vehicle_lidar.inverse()}), 0)
+    last = _play(moved, messages)[-1]
+    plain = _play(CalibrationNode(SETTINGS, config), _messages(bag)[:FEW])[-1]
+    # The points are rounded otherwise, and few frames tell the way along the road badly.
+    cTl, expected = (np.array(_line(one)["T_camera_lidar"]) for one in (last, plain))
+    sigmas = np.sqrt(np.diag(_line(plain)["covariance"]))
+    away = gtsam.Pose3.Logmap(gtsam.Pose3(expected).between(gtsam.Pose3(cTl)))
+    assert (np.abs(away) < 0.5 * sigmas[:6]).all() and np.abs(away[3:]).max() < 0.02
+    (one,) = last.transforms.transforms
+    assert (one.header.frame_id, one.child_frame_id) == (CAMERA_FRAME, "vehicle")
+    q, t = one.transform.rotation, one.transform.translation
+    oTv = gtsam.Pose3(gtsam.Rot3.Quaternion(q.w, q.x, q.y, q.z), [t.x, t.y, t.z])
+    np.testing.assert_allclose((oTv * T_vehicle_lidar).matrix(), cTl, atol=1e-8)
+
+
 def test_what_is_published_can_be_serialized(bag: Any, config: TrackerConfig) -> None:
     from sst_graph.ros_node.published import NodeMessages
 
@@ -287,6 +317,8 @@ def test_queues_are_bounded(bag: Any, config: TrackerConfig) -> None:
         {"hold_s": -1.0},
         {"queue": 1},
         {"cloud_topic": ""},
+        {"lidar_pose": "1.4,0"},
+        {"sweep": "clockwise", "lidar_pose": "1.4,0,1.7"},
     ],
 )
 def test_wrong_parameters_are_refused(changes: dict[str, Any]) -> None:
