@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from sst_graph import CalibrationConfig, calibrate, open_source
 from sst_graph.experiments.markdown import lines, table
+from sst_graph.experiments.starts import error_of
 from sst_graph.simulator import SimulationConfig, simulate
-from sst_graph.types import Calibration, GroundTruth, Source
+from sst_graph.types import Source
 from studies.simulators.third_street import ThirdConfig, ThirdStreet
 
 FloatArray = NDArray[np.float64]
@@ -77,12 +78,6 @@ def sigma_cells(covariance: FloatArray) -> tuple[str, str, str]:
     """Sigmas of a (7, 7) covariance, as :func:`cells` has errors."""
     rotation, translation, offset = cells(np.sqrt(np.diag(covariance)))
     return rotation.replace("+", ""), translation.replace("+", ""), offset.replace("+", "")
-
-
-def error_of(estimate: Calibration, truth: GroundTruth) -> FloatArray:
-    """(7,) from the truth to an estimate, in the LiDAR's axes [rad, m, s]."""
-    assert truth.time_offset_s is not None
-    return Calibration(truth.cTl, truth.time_offset_s).local_coordinates(estimate)
 
 
 def nees_of(error: FloatArray, covariance: FloatArray) -> float:

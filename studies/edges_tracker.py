@@ -21,8 +21,9 @@ import numpy as np
 
 from sst_graph import CalibrationConfig, Tracker, TrackerConfig
 from sst_graph.experiments.markdown import lines
+from sst_graph.experiments.starts import error_of
 from sst_graph.odometry.sweep import with_sweep
-from studies.edges_streets import cells, error_of, short, sigma_cells, source_of, start_step
+from studies.edges_streets import cells, short, sigma_cells, source_of, start_step
 
 AWAY = np.array([*np.radians([3.0, -4.0, 2.5]), 0.06, -0.08, 0.05])
 

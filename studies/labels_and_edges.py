@@ -23,12 +23,12 @@ from sst_graph.batch.by_edges.fusion import Fused
 from sst_graph.batch.method_estimate import MethodEstimate
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.experiments.markdown import lines
+from sst_graph.experiments.starts import error_of
 from sst_graph.result import CalibrationResult
 from sst_graph.types import Calibration, Frame, SemanticClass
 from studies.edges_streets import (
     FloatArray,
     cells,
-    error_of,
     nees_of,
     short,
     sigma_cells,

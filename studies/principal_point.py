@@ -19,8 +19,9 @@ import numpy as np
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drives
 from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.experiments.starts import error_of
 from sst_graph.experiments.wrong_drives import with_principal_point
-from studies.edges_streets import error_of, nees_of, short, sigma_cells, source_of, start_step
+from studies.edges_streets import nees_of, short, sigma_cells, source_of, start_step
 
 OFF_PX = ((0.0, 0.0), (5.0, 0.0), (0.0, -6.0))
 PREVALENCES = (0.02, 0.1, 0.25)

@@ -22,8 +22,9 @@ from sst_graph import CalibrationConfig
 from sst_graph.batch.calibrate import finished, joint_method, prepare_drives
 from sst_graph.covariance.image_shifts import image_shifts
 from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.experiments.starts import error_of
 from sst_graph.types import Guess
-from studies.edges_streets import error_of, source_of, start_step
+from studies.edges_streets import source_of, start_step
 from studies.subtle_faults import with_numbered_images
 
 FloatArray = NDArray[np.float64]

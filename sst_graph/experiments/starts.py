@@ -50,5 +50,8 @@ def errors_of(result: CalibrationResult, truth: GroundTruth) -> CalibrationError
 
 
 def error_of(estimate: Calibration, truth: GroundTruth) -> FloatArray:
-    """(7,) truth less estimate in the estimate's tangent space [rad, m, s]; an unknown true offset is 0."""
-    return estimate.local_coordinates(Calibration(truth.cTl, truth.time_offset_s or 0.0))
+    """(7,) estimate less truth in the tangent space of the estimate, as its covariance [rad, m, s].
+
+    An unknown true offset is 0.
+    """
+    return -estimate.local_coordinates(Calibration(truth.cTl, truth.time_offset_s or 0.0))

@@ -20,7 +20,7 @@ from sst_graph import CalibrationConfig, Tracker, TrackerConfig, open_source
 from sst_graph.association.edge_matching import MatchConfig
 from sst_graph.batch.by_edges.problem import POINTS_A_SCAN
 from sst_graph.cli import main
-from sst_graph.experiments.starts import errors_of
+from sst_graph.experiments.starts import error_of, errors_of
 from sst_graph.factors.alignment import weighted_residuals
 from sst_graph.features.picture_gradients import PictureGradients
 from sst_graph.graph.known import KnownCalibration
@@ -34,7 +34,7 @@ from sst_graph.tracker.start.initializer import InitialGraph
 from sst_graph.tracker.sums.held import EDGE_ERRORS, SHIFTS, edge_error_columns, held_names
 from sst_graph.tracker.track_update import TrackUpdate
 from sst_graph.types import CameraImage, Frame, Scan, SemanticClass, Source
-from studies.edges_streets import error_of, source_of, start_step
+from studies.edges_streets import source_of, start_step
 
 VEHICLE, OBJECT, IGNORE = SemanticClass.VEHICLE, SemanticClass.OBJECT, int(SemanticClass.IGNORE)
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"

@@ -26,6 +26,7 @@ from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.covariance.shared_errors import FEWEST, spread_covariance
 from sst_graph.drive.preparation import Drive
+from sst_graph.experiments.starts import error_of
 from sst_graph.features.lidar_edges import Edge
 from sst_graph.graph.outer_loop import solve_joint
 from sst_graph.graph.state import State
@@ -34,7 +35,7 @@ from sst_graph.simulator import SimulationConfig
 from sst_graph.stepwise import run_to_end
 from sst_graph.types import Guess, SemanticClass
 from studies.edges_poor_scenes import SCENES, START, drive_through
-from studies.edges_streets import error_of, source_of, start_step
+from studies.edges_streets import source_of, start_step
 
 STREET = SimulationConfig(seed=504, frames=3, motion="no_stop", azimuth_limit_deg=50.0, width=621, height=188)
 
