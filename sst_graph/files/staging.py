@@ -177,12 +177,13 @@ def _claimed(target: Path, made: list[Path]) -> Stage:
     for _ in range(_ATTEMPTS):
         fresh = _fresh_name(target)
         lock = _locked_folder(fresh)
+        if lock is None:
+            continue
         try:
             # A rename replaces an empty folder, never one that names its owner.
             os.rename(fresh, path)
         except OSError as error:
-            os.close(lock)
-            remove(fresh)
+            _give_up(fresh, lock)
             if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOENT, errno.ENOTDIR):
                 raise
             _clear(path, target)
@@ -191,18 +192,29 @@ def _claimed(target: Path, made: list[Path]) -> Stage:
     raise ConfigError(f"{target}: other runs of sst-graph keep writing it, expected to be the only one")
 
 
-def _locked_folder(path: Path) -> int:
-    """Make a folder that names its owner, and lock it."""
+def _locked_folder(path: Path) -> int | None:
+    """Make a folder that names its owner, and lock it; None where another run, which sweeps, took it for
+    abandoned before it was locked."""
     path.mkdir()
+    lock = None
     try:
-        lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        lock_file(lock)
-        owner = {"host": socket.gethostname(), "process": os.getpid()}
-        (path / OWNER).write_text(json.dumps(owner), encoding="utf-8")
+        with suppress(FileNotFoundError):
+            lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        if lock is not None and lock_file(lock) and path.exists():
+            owner = {"host": socket.gethostname(), "process": os.getpid()}
+            (path / OWNER).write_text(json.dumps(owner), encoding="utf-8")
+            return lock
     except BaseException:
-        remove(path)
+        _give_up(path, lock)
         raise
-    return lock
+    _give_up(path, lock)
+    return None
+
+
+def _give_up(path: Path, lock: int | None) -> None:
+    remove(path)
+    if lock is not None:
+        os.close(lock)
 
 
 def sweep_folder(folder: Path, short: str | None = None) -> None:
