@@ -17,8 +17,9 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sst_graph.errors import ConfigError
+from sst_graph.errors import ConfigError, DataError
 from sst_graph.files.manifest import give_back
+from sst_graph.files.reading import FileKind, read_json, read_text
 
 SUFFIX = ".sst-graph-partial"
 """Ends the name of everything that is not finished."""
@@ -33,6 +34,8 @@ DONE = "done"
 
 EXCHANGE = "exchange"
 """Holds the inode number of the new folder from just before an exchange on: shows whether it took place."""
+
+_NOTE = FileKind("a note in a staging folder", 4096)
 
 _LONGEST_NAME = 180
 """Bytes of a name that are kept in the staging folder's; file systems allow 255 in all."""
@@ -291,15 +294,15 @@ def _save_former(path: Path, target: Path) -> None:
 def _exchanged(path: Path, target: Path) -> bool:
     """Whether the new folder has its name, and the former one still the name of the new."""
     try:
-        return int((path / EXCHANGE).read_text(encoding="ascii")) == target.stat().st_ino
-    except (OSError, ValueError):
+        return int(read_text(path / EXCHANGE, _NOTE)) == target.stat().st_ino
+    except (OSError, ValueError, DataError):
         return False
 
 
 def _owner(path: Path) -> dict[str, object]:
     try:
-        owner = json.loads((path / OWNER).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        owner = read_json(path / OWNER, _NOTE)
+    except DataError:
         return {}
     return owner if isinstance(owner, dict) else {}
 

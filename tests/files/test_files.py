@@ -469,3 +469,23 @@ def test_a_sweep_leaves_what_another_is_writing(tmp_path: Path) -> None:
         over.set()
         sweeping.join()
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"a": "2999", "b": "b"}
+
+
+@pytest.mark.parametrize("size", ["1e999", "Infinity", "1" + "0" * 5000, "null", "[" * 200_000, "fifo"])
+def test_a_manifest_that_cannot_be_used_is_none(tmp_path: Path, size: str) -> None:
+    """No error of another kind, and nothing that blocks."""
+    with atomic_directory(tmp_path / "out", False, KIND) as folder:
+        (folder / "a").write_text("one")
+    path = tmp_path / "out" / MANIFEST
+    text = path.read_text()
+    path.unlink()
+    if size == "fifo":
+        os.mkfifo(path)
+    else:
+        path.write_text(text.replace("3,", f"{size},", 1))
+    with (
+        pytest.raises(ConfigError, match="found a folder without"),
+        atomic_directory(tmp_path / "out", True, KIND),
+    ):
+        pass
+    assert (tmp_path / "out" / "a").read_text() == "one"
