@@ -58,8 +58,8 @@ def check_classes(sources: Sequence[Source], classes: Sequence[SemanticClass], a
 
 
 def store_to_fill(folder: Path | None) -> LabelStore:
-    """The folder that labels are to be written to: new or empty, or one of labels, though only begun; None: the
-    user's cache.
+    """The folder that labels are to be written to: new, empty, or one of labels, even if only begun; None:
+    the user's cache.
 
     Raises:
         ConfigError: it holds something else, or is no folder.
