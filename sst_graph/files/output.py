@@ -153,7 +153,7 @@ def output_file(path: str | Path, overwrite: bool, kind: OutputFileKind = TEXT) 
     """
     check_file_target(path, overwrite, kind)
     target = real_path(path)
-    with _claimed(path, target) as stage:
+    with _claimed(path, target) as stage, _named(target, stage.new, nameless=False):
         yield OutputFile(stage, path, overwrite)
 
 
@@ -170,13 +170,17 @@ def _claimed(path: str | Path, target: Path) -> Iterator[Stage]:
 
 
 @contextmanager
-def _named(target: Path, partial: Path) -> Iterator[None]:
-    """Errors of writing that name the output, not where it stands while it is not finished."""
+def _named(target: Path, partial: Path, nameless: bool = True) -> Iterator[None]:
+    """Errors of writing that name the output, not where it stands while it is not finished.
+
+    Args:
+        nameless: whether those that name nothing are about it, too.
+    """
     try:
         yield
     except OSError as error:
         name, hidden = error.filename, str(partial)
-        if name is None and error.errno is not None:
+        if nameless and name is None and error.errno is not None:
             error.filename = str(target)
         elif isinstance(name, str) and name.startswith(hidden):
             error.filename, error.filename2 = str(target) + name[len(hidden) :], None
