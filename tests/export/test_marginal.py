@@ -549,13 +549,13 @@ def test_graphs_that_cannot_be_used() -> None:
 @pytest.mark.parametrize("wrong", [None, "0.01", True, -0.1, 1.1, float("nan"), [0.01]])
 def test_a_significance_is_a_probability(wrong: object) -> None:
     """NaN is none: nothing would be tested by it."""
-    with pytest.raises(FactorError, match="significance: found .*, expected a probability from 0 to 1"):
+    with pytest.raises(FactorError, match=r"significance: found .*, expected a probability from 0 to 1"):
         fuse_marginals([marginal_of_graph(*_priors("ED"))], significance=wrong)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("wrong", [None, 5, "a", ["a", 3]])
 def test_names_are_texts(wrong: object) -> None:
-    with pytest.raises(FactorError, match="names: found .*, expected a (list of )?text"):
+    with pytest.raises(FactorError, match=r"names: found .*, expected a (list of )?text"):
         fuse_marginals([marginal_of_graph(*_priors("ED"))], names=wrong)  # type: ignore[arg-type]
 
 
