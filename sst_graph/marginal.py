@@ -463,18 +463,26 @@ def _unit(information: FloatArray) -> FloatArray:
 
 
 def _symmetric(unit: FloatArray) -> bool:
-    """Whether it is, but for rounding."""
-    return bool((np.abs(unit - unit.T) <= 1e-6).all())
+    """Whether it is, but for rounding; of a difference of two informations entries beside the diagonal may
+    be far above one."""
+    return bool((np.abs(unit - unit.T) <= 1e-6 * np.maximum(1.0, np.abs(unit))).all())
 
 
 def carried(marginal: CalibrationMarginal, to: Calibration) -> CalibrationMarginal:
     """The same cost, expanded about another point: d_0 = shift + J d, J the derivative of Log(T0^-1 T
-    Exp(d))."""
+    Exp(d)).
+
+    The information may be of any sign, such as what a tracker adds to an earlier marginal: its entries may
+    be rounding, which need not be symmetric.
+    """
     shift, J = _moved(marginal, to)
     L, g = marginal.information, marginal.vector
+    information = J.T @ L @ J
+    information = 0.5 * (information + information.T)
     constant = marginal.constant - 2.0 * float(g @ shift) + float(shift @ L @ shift)
     common = replace(marginal.common, errors=_steps_there(marginal.common.errors, J))
-    return CalibrationMarginal(to.cTl, to.time_offset_s, J.T @ L @ J, J.T @ (g - L @ shift), constant, common)
+    vector = J.T @ (g - L @ shift)
+    return CalibrationMarginal(to.cTl, to.time_offset_s, information, vector, constant, common)
 
 
 def _steps_there(errors: Mapping[str, FloatArray], J: FloatArray) -> dict[str, FloatArray]:

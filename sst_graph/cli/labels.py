@@ -58,7 +58,8 @@ def check_classes(sources: Sequence[Source], classes: Sequence[SemanticClass], a
 
 
 def store_to_fill(folder: Path | None) -> LabelStore:
-    """The folder that labels are to be written to: new, empty, or one of labels; None: the user's cache.
+    """The folder that labels are to be written to: new, empty, or one of labels, even if only begun; None:
+    the user's cache.
 
     Raises:
         ConfigError: it holds something else, or is no folder.
@@ -70,7 +71,7 @@ def store_to_fill(folder: Path | None) -> LabelStore:
     store = LabelStore(folder)
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"{folder}: found a file, expected a folder or nothing")
-    if folder.is_dir() and any(folder.iterdir()) and not (store.models("images") or store.models("scans")):
+    if folder.is_dir() and not (store.models("images") or store.models("scans") or store.is_begun()):
         raise ConfigError(f"{folder}: found a folder of other things, expected a new one or one of labels")
     return store
 

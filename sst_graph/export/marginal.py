@@ -15,9 +15,9 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 
-from sst_graph.errors import EstimationError, count_of
+from sst_graph.errors import EstimationError, count_of, first_line
 from sst_graph.export.agreement import SIGNIFICANCE, check_agreement, check_apart
-from sst_graph.factors.arguments import checked_type
+from sst_graph.factors.arguments import checked_type, described
 from sst_graph.factors.errors import FactorError
 from sst_graph.inspect.considered import considered_errors
 from sst_graph.marginal import (
@@ -101,7 +101,8 @@ def marginal_of_graph(
 ) -> CalibrationMarginal:
     """A graph's cost on (E, D), everything else eliminated.
 
-    Exact to second order about its point; as sure as the graph's noise models say.
+    Exact to second order about its point; as sure as the graph's noise models say. Of one of the two that no
+    factor is on it says nothing: its rows are zero.
 
     Args:
         graph, values: the problem, and where it is linearized: its optimum, as a rule.
@@ -110,28 +111,37 @@ def marginal_of_graph(
             offset are held there, and the other variables optimised.
 
     Raises:
-        EstimationError: the other variables are not determined even when E and D are given.
-        FactorError: no graph, no values, or none of E or D.
+        EstimationError: the other variables are not determined even when E and D are given, or a factor
+            cannot be linearized or eliminated, such as one of a constrained noise model.
+        FactorError: no graph, no values, or none of E, D or another variable of the graph.
     """
     E_key, D_key = _checked_keys(graph, values, E_key, D_key)
     if at is not None:
         values = _others_at(graph, values, E_key, D_key, _point(at))
-    others = [key for key in values.keys() if key not in (E_key, D_key)]  # noqa: SIM118  (gtsam, no dict)
-    ordering = gtsam.Ordering()
-    for key in (E_key, D_key, *others):
-        ordering.push_back(key)
-    linear = graph.linearize(values)
-    augmented = linear.augmentedHessian(ordering)
+    calibration, _ = _calibration_in(values, E_key, D_key)
+    try:
+        linear = graph.linearize(values)
+        keys = list(linear.keyVector())
+        ordering = gtsam.Ordering()
+        for key in sorted(keys, key=lambda key: (key != E_key, key != D_key, key)):
+            ordering.push_back(key)
+        augmented = linear.augmentedHessian(ordering)
+    except (RuntimeError, ValueError) as error:
+        raise EstimationError(f"graph: cannot be linearized and eliminated ({first_line(error)})") from error
+    known = [*(range(6) if E_key in keys else ()), *((6,) if D_key in keys else ())]
+    n = len(known)
     G, g, f = augmented[:-1, :-1], augmented[:-1, -1], float(augmented[-1, -1])
-    inner = _inverse(G[7:, 7:], "information of the variables to eliminate")
-    coupling = G[:7, 7:] @ inner
-    information = G[:7, :7] - coupling @ G[7:, :7]
+    inner = _inverse(G[n:, n:], "information of the variables to eliminate")
+    coupling = G[:n, n:] @ inner
+    information, vector = np.zeros((7, 7)), np.zeros(7)
+    information[np.ix_(known, known)] = G[:n, :n] - coupling @ G[n:, :n]
+    vector[known] = g[:n] - coupling @ g[n:]
     return CalibrationMarginal(
-        values.atPose3(E_key),
-        float(values.atVector(D_key)[0]),
+        calibration.cTl,
+        calibration.time_offset_s,
         0.5 * (information + information.T),
-        g[:7] - coupling @ g[7:],
-        f - float(g[7:] @ inner @ g[7:]),
+        vector,
+        f - float(g[n:] @ inner @ g[n:]),
     )
 
 
@@ -139,13 +149,40 @@ def _checked_keys(graph: object, values: object, E_key: int, D_key: int) -> tupl
     """The keys of extrinsic and time offset, if these are a graph and its values, and have them."""
     checked_type("graph", graph, gtsam.NonlinearFactorGraph, "a NonlinearFactorGraph")
     checked_type("values", values, gtsam.Values, "Values")
-    assert isinstance(values, gtsam.Values)
+    assert isinstance(graph, gtsam.NonlinearFactorGraph) and isinstance(values, gtsam.Values)
     E, D = marginal_keys(E_key, D_key)
     for key in (E, D):
         if not values.exists(key):
             expected = f"one of the key {gtsam.DefaultKeyFormatter(key)}"
             raise FactorError("values", "none of extrinsic or time offset", expected)
+    for key in graph.keyVector():
+        if not values.exists(key):
+            found = f"none of the key {gtsam.DefaultKeyFormatter(key)}"
+            raise FactorError("values", found, "one of each variable of the graph")
     return E, D
+
+
+def _calibration_in(values: gtsam.Values, E_key: int, D_key: int) -> tuple[Calibration, bool]:
+    """Extrinsic and time offset, and whether the offset is kept as a ``double``.
+
+    Raises:
+        FactorError: variables of another kind.
+    """
+    E, D = (gtsam.DefaultKeyFormatter(key) for key in (E_key, D_key))
+    try:
+        cTl = values.atPose3(E_key)
+    except RuntimeError:
+        raise FactorError("values", f"a variable {E} of another kind", "a Pose3, the extrinsic") from None
+    try:
+        return Calibration(cTl, values.atDouble(D_key)), True
+    except RuntimeError:
+        pass
+    try:
+        (offset_s,) = values.atVector(D_key)
+    except (RuntimeError, ValueError):
+        expected = "a vector of one number or a double, the time offset"
+        raise FactorError("values", f"a variable {D} of another kind", expected) from None
+    return Calibration(cTl, float(offset_s)), False
 
 
 def _point(at: Calibration | tuple[gtsam.Pose3, float]) -> Calibration:
@@ -169,21 +206,24 @@ def _others_at(
 ) -> gtsam.Values:
     """Values with (E, D) at a point and the others at their optimum given that."""
     cTl, time_offset_s = at
+    _, double = _calibration_in(values, E_key, D_key)
+    prior = gtsam.PriorFactorDouble if double else gtsam.PriorFactorVector
+    offset = time_offset_s if double else np.array([time_offset_s])
     there = gtsam.Values(values)
     there.update(E_key, cTl)
-    there.update(D_key, np.array([time_offset_s]))
+    there.update(D_key, offset)
     if there.size() == 2:
         return there
     held = gtsam.NonlinearFactorGraph(graph)
     held.add(gtsam.NonlinearEqualityPose3(E_key, cTl))
-    held.add(gtsam.PriorFactorVector(D_key, np.array([time_offset_s]), gtsam.noiseModel.Constrained.All(1)))
+    held.add(prior(D_key, offset, gtsam.noiseModel.Constrained.All(1)))
     params = gtsam.LevenbergMarquardtParams()
     params.setRelativeErrorTol(1e-12)
     params.setAbsoluteErrorTol(0.0)
     try:
         return gtsam.LevenbergMarquardtOptimizer(held, there, params).optimize()
-    except RuntimeError as error:
-        raise EstimationError(f"variables to eliminate: not determined ({error})") from error
+    except (RuntimeError, ValueError) as error:
+        raise EstimationError(f"variables to eliminate: not determined ({first_line(error)})") from error
 
 
 def fuse_graphs(
@@ -257,8 +297,12 @@ def fuse_marginals(
         ContradictionError: they contradict one another; the message names the worst and its step.
         EstimationError: none given, a direction that none of them determines, one that takes information away
             (to be added with ``significance=0``), no optimum, or two of the same scans.
-        FactorError: no marginals.
+        FactorError: no marginals, no names, or no probability.
     """
+    _check_probability(significance)
+    checked_type("names", names, (list, tuple), "a list of texts")
+    for name in names:
+        checked_type("one of names", name, str, "a text")
     checked_type("marginals", marginals, (list, tuple), "a list of CalibrationMarginal")
     for each in marginals:
         checked_type("marginals", each, CalibrationMarginal, "a list of CalibrationMarginal")
@@ -294,6 +338,12 @@ def fuse_marginals(
     check_agreement(parts, fused.cTl, names, significance)
     errors = weighted_steps([one.carried(fused.at) for one in separate])
     return Separated(fused, errors).together()
+
+
+def _check_probability(significance: object) -> None:
+    number = isinstance(significance, int | float) and not isinstance(significance, bool)
+    if not (number and 0.0 <= float(significance) <= 1.0):  # type: ignore[arg-type]
+        raise FactorError("significance", described(significance), "a probability from 0 to 1")
 
 
 _MAX_ROUNDS, _STANDSTILL_SIGMAS = 50, 1e-6

@@ -13,6 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from sst_graph.errors import DataError
+from sst_graph.files.reading import FileKind, read_json
+
 MANIFEST = ".sst-graph-manifest.json"
 FORMAT = "sst-graph/manifest"
 VERSION = 1
@@ -20,6 +23,7 @@ VERSION = 1
 KEPT = ".kept"
 """Is appended to the name of a file of others where a new file of ours needs it."""
 
+_MANIFEST = FileKind("the manifest of a folder", 256 * 1024 * 1024)
 _CHUNK = 1 << 20
 
 
@@ -64,12 +68,12 @@ def write_manifest(folder: Path, kind: OutputKind) -> None:
 def read_manifest(folder: Path) -> Manifest | None:
     """The manifest of a folder, or None where there is none that can be read."""
     try:
-        document = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+        document = read_json(folder / MANIFEST, _MANIFEST)
         if document["format"] != FORMAT or document["version"] != VERSION:
             return None
         files = {str(path): (int(size), str(digest)) for path, (size, digest) in document["files"].items()}
         return Manifest(str(document["kind"]), files)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    except (DataError, ValueError, KeyError, TypeError, AttributeError):
         return None
 
 

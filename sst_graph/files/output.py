@@ -10,7 +10,7 @@ import os
 import sys
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -35,8 +35,8 @@ def atomic_write_bytes(path: str | Path, data: bytes) -> None:
     """
     target = real_path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    with staging.temporary(target) as partial, _named(target, partial):
-        _write_through(partial, data)
+    with _locked_file(target) as (partial, stream):
+        _write_through(stream, data)
         os.replace(partial, target)
         _sync_folder(target.parent)
 
@@ -55,9 +55,8 @@ def atomic_write_in_steps(path: str | Path, fill: Callable[[BinaryIO], Iterator[
     """
     target = real_path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    with staging.temporary(target) as partial, _named(target, partial):
-        with open(partial, "xb") as stream, ThreadPoolExecutor(1) as aside:
-            staging.lock_file(stream.fileno())
+    with _locked_file(target) as (partial, stream):
+        with ThreadPoolExecutor(1) as aside:
             yield from fill(stream)
             stream.flush()
             flushed = aside.submit(os.fsync, stream.fileno())
@@ -115,7 +114,8 @@ class OutputFile:
         stage = self._stage
         with _named(stage.target, stage.new), uninterrupted():
             stage.new.unlink(missing_ok=True)
-            _write_through(stage.new, data)
+            with open(stage.new, "xb") as stream:
+                _write_through(stream, data)
             self._publish()
 
     @property
@@ -153,7 +153,7 @@ def output_file(path: str | Path, overwrite: bool, kind: OutputFileKind = TEXT) 
     """
     check_file_target(path, overwrite, kind)
     target = real_path(path)
-    with _claimed(path, target) as stage:
+    with _claimed(path, target) as stage, _named(target, stage.new, nameless=False):
         yield OutputFile(stage, path, overwrite)
 
 
@@ -170,13 +170,17 @@ def _claimed(path: str | Path, target: Path) -> Iterator[Stage]:
 
 
 @contextmanager
-def _named(target: Path, partial: Path) -> Iterator[None]:
-    """Errors of writing that name the output, not where it stands while it is not finished."""
+def _named(target: Path, partial: Path, nameless: bool = True) -> Iterator[None]:
+    """Errors of writing that name the output, not where it stands while it is not finished.
+
+    Args:
+        nameless: whether those that name nothing are about it, too.
+    """
     try:
         yield
     except OSError as error:
         name, hidden = error.filename, str(partial)
-        if name is None and error.errno is not None:
+        if nameless and name is None and error.errno is not None:
             error.filename = str(target)
         elif isinstance(name, str) and name.startswith(hidden):
             error.filename, error.filename2 = str(target) + name[len(hidden) :], None
@@ -290,12 +294,26 @@ def _exchange(a: Path, b: Path) -> bool:
     raise OSError(code, os.strerror(code), str(b))
 
 
-def _write_through(path: Path, data: bytes) -> None:
-    with open(path, "xb") as stream:
-        staging.lock_file(stream.fileno())
-        stream.write(data)
-        stream.flush()
-        os.fsync(stream.fileno())
+@contextmanager
+def _locked_file(target: Path) -> Iterator[tuple[Path, BinaryIO]]:
+    """A new file beside ``target``, to be renamed in the block; it is locked until then, or removed.
+
+    A run that sweeps the folder may take the file for abandoned before it is locked. Then another is made.
+    """
+    with ExitStack() as held:
+        while True:
+            partial = held.enter_context(staging.temporary(target))
+            held.enter_context(_named(target, partial))
+            stream = held.enter_context(open(partial, "xb"))
+            if staging.lock_file(stream.fileno()) and partial.exists():
+                break
+        yield partial, stream
+
+
+def _write_through(stream: BinaryIO, data: bytes) -> None:
+    stream.write(data)
+    stream.flush()
+    os.fsync(stream.fileno())
 
 
 def _sync_tree(folder: Path) -> None:

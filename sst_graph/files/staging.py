@@ -17,8 +17,9 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sst_graph.errors import ConfigError
+from sst_graph.errors import ConfigError, DataError
 from sst_graph.files.manifest import give_back
+from sst_graph.files.reading import FileKind, read_json, read_text
 
 SUFFIX = ".sst-graph-partial"
 """Ends the name of everything that is not finished."""
@@ -33,6 +34,8 @@ DONE = "done"
 
 EXCHANGE = "exchange"
 """Holds the inode number of the new folder from just before an exchange on: shows whether it took place."""
+
+_NOTE = FileKind("a note in a staging folder", 4096)
 
 _LONGEST_NAME = 180
 """Bytes of a name that are kept in the staging folder's; file systems allow 255 in all."""
@@ -177,12 +180,13 @@ def _claimed(target: Path, made: list[Path]) -> Stage:
     for _ in range(_ATTEMPTS):
         fresh = _fresh_name(target)
         lock = _locked_folder(fresh)
+        if lock is None:
+            continue
         try:
             # A rename replaces an empty folder, never one that names its owner.
             os.rename(fresh, path)
         except OSError as error:
-            os.close(lock)
-            remove(fresh)
+            _give_up(fresh, lock)
             if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOENT, errno.ENOTDIR):
                 raise
             _clear(path, target)
@@ -191,18 +195,29 @@ def _claimed(target: Path, made: list[Path]) -> Stage:
     raise ConfigError(f"{target}: other runs of sst-graph keep writing it, expected to be the only one")
 
 
-def _locked_folder(path: Path) -> int:
-    """Make a folder that names its owner, and lock it."""
+def _locked_folder(path: Path) -> int | None:
+    """Make a folder that names its owner, and lock it; None where another run, which sweeps, took it for
+    abandoned before it was locked."""
     path.mkdir()
+    lock = None
     try:
-        lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        lock_file(lock)
-        owner = {"host": socket.gethostname(), "process": os.getpid()}
-        (path / OWNER).write_text(json.dumps(owner), encoding="utf-8")
+        with suppress(FileNotFoundError):
+            lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        if lock is not None and lock_file(lock) and path.exists():
+            owner = {"host": socket.gethostname(), "process": os.getpid()}
+            (path / OWNER).write_text(json.dumps(owner), encoding="utf-8")
+            return lock
     except BaseException:
-        remove(path)
+        _give_up(path, lock)
         raise
-    return lock
+    _give_up(path, lock)
+    return None
+
+
+def _give_up(path: Path, lock: int | None) -> None:
+    remove(path)
+    if lock is not None:
+        os.close(lock)
 
 
 def sweep_folder(folder: Path, short: str | None = None) -> None:
@@ -279,15 +294,15 @@ def _save_former(path: Path, target: Path) -> None:
 def _exchanged(path: Path, target: Path) -> bool:
     """Whether the new folder has its name, and the former one still the name of the new."""
     try:
-        return int((path / EXCHANGE).read_text(encoding="ascii")) == target.stat().st_ino
-    except (OSError, ValueError):
+        return int(read_text(path / EXCHANGE, _NOTE)) == target.stat().st_ino
+    except (OSError, ValueError, DataError):
         return False
 
 
 def _owner(path: Path) -> dict[str, object]:
     try:
-        owner = json.loads((path / OWNER).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        owner = read_json(path / OWNER, _NOTE)
+    except DataError:
         return {}
     return owner if isinstance(owner, dict) else {}
 

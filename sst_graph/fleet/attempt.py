@@ -88,9 +88,14 @@ def run_drive(job: Job) -> Record:
         kills += record.status == "killed"
         record = replace(record, cost=replace(record.cost, attempts=attempts))
     if attempts and not has_ended():
-        with contextlib.suppress(SstGraphError, OSError):
-            job.record.write(record.to_json().encode("utf-8"))
+        _write_record(job, record)
     return record
+
+
+def _write_record(job: Job, record: Record) -> None:
+    """Write what became of a drive; its result counts without it, too."""
+    with contextlib.suppress(SstGraphError, OSError):
+        job.record.write(record.to_json().encode("utf-8"))
 
 
 def _is_to_be_repeated(status: Status, has_retries: bool, kills: int) -> bool:
@@ -104,7 +109,7 @@ def finished_record(job: Job, stored: bytes | None = None) -> Record | None:
     """The record of a drive whose result stands there whole, or None.
 
     A record is written after the result. Where it is missing (the batch was killed between the two), it is
-    made from the result.
+    made from the result, and written.
 
     Args:
         stored: contents of the record's file, where the caller has read it; the result's folder is there.
@@ -121,11 +126,15 @@ def finished_record(job: Job, stored: bytes | None = None) -> Record | None:
         if not (job.result / MANIFEST).exists():
             return None
         if job.result.is_local:
-            return _of_result(job, job.result.path)
-        with scratch_folder() as scratch:
-            return _of_result(job, job.result.fetch(scratch))
+            made = _of_result(job, job.result.path)
+        else:
+            with scratch_folder() as scratch:
+                made = _of_result(job, job.result.fetch(scratch))
     except SstGraphError:
         return None
+    if made is not None:
+        _write_record(job, made)
+    return made
 
 
 def _is_whole(job: Job, is_there: bool) -> bool:

@@ -20,7 +20,7 @@ from sst_graph.covariance.observability import ObservabilityConfig
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.files.json_table import json_table
 from sst_graph.files.reading import FileKind, digest_of_file
-from sst_graph.files.staging import lock_file
+from sst_graph.files.staging import lock_file, sweep_folder
 from sst_graph.files.strict_json import strict_json
 from sst_graph.fleet.attempt import DRIVES, RECORDS, Job, finished_record, remove_unfinished, run_drive
 from sst_graph.fleet.dask_pool import run_on_dask
@@ -160,6 +160,9 @@ def open_batch(out: Place, options: Sequence[str]) -> Iterator[None]:
             }
             (out / BATCH).write((strict_json(document) + "\n").encode("utf-8"))
         sweep_scratch()
+        for folder in (out, out / RECORDS, out / VEHICLES):
+            if folder.is_local and folder.is_folder():
+                sweep_folder(folder.path)
         remove_unfinished(out)
         yield
 

@@ -38,6 +38,7 @@ from sst_graph.data.images import read_instances, read_mask
 from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.files import atomic_write_bytes, atomic_write_text, sweep_folder
 from sst_graph.files.reading import FileKind, read_json
+from sst_graph.files.staging import SUFFIX
 from sst_graph.segmentation.segmenter import ImageLabels, PointLabels, Segmenter
 from sst_graph.types import CameraImage, Scan, SemanticClass, intensities_of
 
@@ -103,6 +104,13 @@ class LabelStore:
                 f"{self.folder}: found labels of {count_of(len(models), 'network')} ({named}): give {option}"
             )
         return models[0] if models else None
+
+    def is_begun(self) -> bool:
+        """Whether it is empty, or as a run leaves it that ends before its first label."""
+        if {entry.name for entry in self.folder.iterdir()} - {"images", "scans"}:
+            return False
+        names = (name for _, _, files in os.walk(self.folder) for name in files)
+        return all(name.endswith(SUFFIX) for name in names)
 
     def enter(self, side: Side, segmenter: Segmenter) -> StoredModel:
         """Make a place for the labels of a network; what a killed run left half-written there is removed."""

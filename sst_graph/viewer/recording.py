@@ -25,6 +25,7 @@ from sst_graph.sampling import step_for
 from sst_graph.tracker.track_update import TrackUpdate
 from sst_graph.types import Calibration, FloatArray, SemanticClass
 from sst_graph.viewer.frame_view import FrameView, MatchView
+from sst_graph.viewer.recorded_file import RecordedFile
 from sst_graph.viz.overlay import CLASS_COLOURS, IN_MASK, OTHER_COLOUR
 
 LIDAR = "world/lidar"
@@ -83,10 +84,18 @@ class Recording:
         Raises:
             MissingDependencyError: rerun is not installed.
             ConfigError: no viewer can be opened.
+            OSError: the file cannot be written; so do the other methods.
         """
         self._rr, self._camera = rerun(), camera
         self._stream = self._rr.RecordingStream("sst-graph")
-        self._stream.set_sinks(*self._sinks(live, save), default_blueprint=_blueprint(tracked))
+        live_sinks = self._live_sinks() if live else []
+        self._file = None if save is None else RecordedFile(save)
+        file_sinks = [] if self._file is None else [self._rr.FileSink(self._file.pipe)]
+        try:
+            self._stream.set_sinks(*file_sinks, *live_sinks, default_blueprint=_blueprint(tracked))
+        finally:
+            if self._file is not None:
+                self._file.begin()
         self._first_ns: int | None = None
         self._path: deque[FloatArray] = deque(maxlen=_MOST_POSES)
         self._tracks: dict[int, deque[FloatArray]] = {}
@@ -107,12 +116,16 @@ class Recording:
             raise ConfigError(f"the viewer rerun has gone: {why} (without a screen, save a file)") from error
         finally:
             self._stream.disconnect()
+            if self._file is not None:
+                self._file.finish(_LONGEST_FLUSH_S)
 
     # ------------------------------------------------------------------ what is logged
 
     def frame(self, view: FrameView) -> None:
         """A frame: cloud, pose, picture, points in the picture, matches, tracks."""
         rr, scan = self._rr, view.scan
+        if self._file is not None:
+            self._file.check()
         self._at(view.number, scan.stamp_ns)
         self._log(LIDAR, _transform(rr, view.oTl))
         self._log(CAMERA, _transform(rr, view.cTl.inverse()))
@@ -179,20 +192,17 @@ class Recording:
 
     # ------------------------------------------------------------------ how
 
-    def _sinks(self, live: bool, save: Path | None) -> list[Any]:
-        rr, sinks = self._rr, []
-        if save is not None:
-            sinks.append(rr.FileSink(str(save)))
-        if live:
-            _check_screen()
-            try:
-                # Without the recording, the global one is asked, and says that it is disabled.
-                rr.spawn(connect=False, recording=self._stream, executable_path=_executable())
-            except Exception as error:
-                why = " ".join(str(error).split())
-                raise ConfigError(f"the viewer rerun cannot be opened: {why} (or save a file)") from error
-            sinks.append(rr.GrpcSink())
-        return sinks
+    def _live_sinks(self) -> list[Any]:
+        """What streams into a viewer, which is opened."""
+        rr = self._rr
+        _check_screen()
+        try:
+            # Without the recording, the global one is asked, and says that it is disabled.
+            rr.spawn(connect=False, recording=self._stream, executable_path=_executable())
+        except Exception as error:
+            why = " ".join(str(error).split())
+            raise ConfigError(f"the viewer rerun cannot be opened: {why} (or save a file)") from error
+        return [rr.GrpcSink()]
 
     def _log(self, path: str, *what: Any, static: bool = False) -> None:
         self._stream.log(path, *what, static=static)

@@ -224,6 +224,10 @@ def test_what_a_killed_batch_left_is_removed_when_the_next_one_begins(tmp_path: 
     with open_batch(Place(str(out)), ()):
         pass
     left, stage = leave(out), claim(out / "drives" / "v2_2026-03-01")
+    for name in ("", "records", "vehicles"):
+        (out / name).mkdir(exist_ok=True)
+        left.append(out / name / ".v1.json.0123456789abcdef.sst-graph-partial")
+        left[-1].write_text("{")
     (out / "drives" / "v1_2026-03-01").mkdir()
     with open_batch(Place(str(out)), ()):
         assert not any(one.exists() for one in left)

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 import pytest
 
+from checks.fault_commands import COMMANDS
 from checks.fault_matrix import (
-    COMMANDS,
     Bench,
     Row,
     ended_by,
@@ -87,6 +87,12 @@ def test_a_kill_leaves_nothing_or_all(bench: Bench) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("command", ["segment", "batch"])
+def test_a_killed_run_that_goes_on_makes_the_same(bench: Bench, command: str) -> None:
+    _holds(kill(bench, COMMANDS[command], [0.6, 0.9]))
+
+
+@pytest.mark.slow
 def test_a_kill_leaves_the_old_or_the_new(bench: Bench) -> None:
     _holds(kill_overwriting(bench, COMMANDS["export"], [0.8, 0.95, 1.0]))
 
@@ -138,7 +144,9 @@ def test_a_full_disk_is_named_and_leaves_nothing(bench: Bench, command: str) -> 
     assert row.finished < row.runs  # a small export fits on the small file system
 
 
-@pytest.mark.parametrize("command", ["simulate", "track", "export"])
+@pytest.mark.parametrize(
+    "command", ["simulate", "track", "export", "import", "segment", "view", "batch", "experiment fit"]
+)
 def test_a_place_that_cannot_be_written_is_refused_before_the_work(bench: Bench, command: str) -> None:
     _holds(read_only(bench, COMMANDS[command]))
 

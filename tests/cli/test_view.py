@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 from sst_graph.cli import main
+from sst_graph.cli.progress import PREFIX
 
 FEW = ["--frames", "0:5"]
 
@@ -70,3 +72,25 @@ def test_without_the_extra_the_message_names_it(street: Path, result: Path, tmp_
         )
         assert done.returncode == 2 and done.stdout == ""
         assert done.stderr.count("\n") == 1 and "pip install 'sst-graph[rerun]'" in done.stderr
+
+
+@pytest.mark.parametrize("most_bytes", [3000, 60_000])
+@pytest.mark.parametrize("command", ["view", "track"])
+def test_a_full_disk_is_told_and_nothing_waits(
+    street: Path, result: Path, tmp_path: Path, command: str, most_bytes: int
+) -> None:
+    """At once, and where some of the file is written; rerun's own writer waits for ever, or says little."""
+    out = tmp_path / "a.rrd"
+    arguments = ["view", str(result), str(street), "--save"]
+    if command == "track":
+        arguments = ["track", str(street), "--set", "calibration.decide_sweep=false", "--view-save"]
+    done = subprocess.run(
+        [sys.executable, "-m", "sst_graph", *arguments, str(out), *FEW],
+        capture_output=True,
+        text=True,
+        timeout=100,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes)),
+    )
+    (line,) = [one for one in done.stderr.splitlines() if PREFIX not in one]
+    assert (done.returncode, line) == (2, f"sst-graph: error: {out}: File too large")
+    assert list(tmp_path.iterdir()) == []

@@ -488,6 +488,77 @@ def test_graphs_of_drives_with_two_mounts_are_refused() -> None:
         fuse_marginals([agreeing(1), agreeing(2)], names=("a",))
 
 
+def _priors(on: str, double: bool = False) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """Priors on some of extrinsic, time offset, and a pose that is tied to the extrinsic."""
+    graph, values, unit = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.noiseModel.Unit
+    values.insert(EXTRINSIC, TRUE)
+    offset = OFFSET_S if double else np.array([OFFSET_S])
+    values.insert(TIME_OFFSET, offset)
+    if "E" in on:
+        graph.add(gtsam.PriorFactorPose3(EXTRINSIC, TRUE, unit.Create(6)))
+    if "D" in on:
+        prior = gtsam.PriorFactorDouble if double else gtsam.PriorFactorVector
+        graph.add(prior(TIME_OFFSET, offset, unit.Create(1)))
+    if "x" in on:
+        values.insert(7, TRUE)
+        graph.add(gtsam.BetweenFactorPose3(EXTRINSIC, 7, gtsam.Pose3(), unit.Create(6)))
+        graph.add(gtsam.PriorFactorPose3(7, TRUE, unit.Create(6)))
+    return graph, values
+
+
+@pytest.mark.parametrize(
+    ("on", "expected"),
+    [("E", [1.0] * 6 + [0.0]), ("D", [0.0] * 6 + [1.0]), ("x", [0.5] * 6 + [0.0]), ("", [0.0] * 7)],
+)
+def test_what_no_factor_is_on_has_no_information(on: str, expected: list[float]) -> None:
+    """With a pose in the graph and no factor on the offset, too: nothing of the pose counts for it."""
+    marginal = marginal_of_graph(*_priors(on))
+    np.testing.assert_allclose(marginal.information, np.diag(expected), atol=1e-12)
+    whole, _ = fuse_graphs([_priors(on), _priors("ED")])
+    np.testing.assert_allclose(whole.information, np.diag(np.add(expected, 1.0)), atol=1e-12)
+
+
+def test_a_time_offset_that_is_a_double() -> None:
+    """As ``time_offset_prior(..., double=True)`` keeps it."""
+    for on in ("ED", "EDx"):
+        one, other = marginal_of_graph(*_priors(on)), marginal_of_graph(*_priors(on, double=True))
+        assert one.to_json() == other.to_json()
+        at = Calibration(TRUE, OFFSET_S + 0.1)
+        moved = marginal_of_graph(*_priors(on, double=True), at=at)
+        assert moved.to_json() == marginal_of_graph(*_priors(on), at=at).to_json()
+
+
+def test_graphs_that_cannot_be_used() -> None:
+    graph, values = _priors("EDx")
+    with pytest.raises(FactorError, match="values: found none of the key 7, expected one of each variable"):
+        marginal_of_graph(graph, _priors("ED")[1])
+    for key, value, message in (
+        (EXTRINSIC, gtsam.Pose2(), "a variable E0 of another kind, expected a Pose3"),
+        (TIME_OFFSET, np.zeros(2), "a variable D0 of another kind, expected a vector of one number"),
+    ):
+        other = gtsam.Values(values)
+        other.erase(key)
+        other.insert(key, value)
+        with pytest.raises(FactorError, match=message):
+            marginal_of_graph(gtsam.NonlinearFactorGraph(), other)
+    graph.add(gtsam.PriorFactorPose3(EXTRINSIC, TRUE, gtsam.noiseModel.Constrained.All(6)))
+    with pytest.raises(EstimationError, match=r"graph: cannot be linearized and eliminated \(.*constrained"):
+        marginal_of_graph(graph, values)
+
+
+@pytest.mark.parametrize("wrong", [None, "0.01", True, -0.1, 1.1, float("nan"), [0.01]])
+def test_a_significance_is_a_probability(wrong: object) -> None:
+    """NaN is none: nothing would be tested by it."""
+    with pytest.raises(FactorError, match=r"significance: found .*, expected a probability from 0 to 1"):
+        fuse_marginals([marginal_of_graph(*_priors("ED"))], significance=wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("wrong", [None, 5, "a", ["a", 3]])
+def test_names_are_texts(wrong: object) -> None:
+    with pytest.raises(FactorError, match=r"names: found .*, expected a (list of )?text"):
+        fuse_marginals([marginal_of_graph(*_priors("ED"))], names=wrong)  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("name", WRONG)
 def test_what_is_no_marginal_is_refused(name: str) -> None:
     """By a sentence of ours, whatever stands in the place of an argument."""

@@ -9,6 +9,7 @@ import signal
 import stat
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
@@ -50,6 +51,17 @@ import os, signal, sys
 from sst_graph.files import atomic_write_text
 os.replace = lambda *_: {KILL}
 atomic_write_text(sys.argv[1], "new" * 100000)
+"""
+CLAIM_OFTEN = """
+import sys
+from pathlib import Path
+from sst_graph.errors import ConfigError
+from sst_graph.files.staging import claim
+for _ in range(4000):
+    try:
+        claim(Path(sys.argv[1])).release()
+    except ConfigError as error:
+        assert "is writing it" in str(error) or "keep writing it" in str(error), error
 """
 KILLED_AT = {
     "while writing": f"output.write_manifest = lambda *_: {KILL}",
@@ -359,6 +371,13 @@ def test_a_second_writer_is_refused_before_its_work(tmp_path: Path) -> None:
     assert tree(tmp_path) == {"out/a": "first"}
 
 
+def test_of_many_writers_each_has_the_name_or_is_told_who_has_it(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", CLAIM_OFTEN, str(tmp_path / "a")]
+    runs = [subprocess.Popen(command, stderr=subprocess.PIPE, text=True) for _ in range(3)]
+    assert [run.communicate(timeout=60)[1] for run in runs] == ["", "", ""]
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_living_temporary_is_left_alone(tmp_path: Path) -> None:
     living = tmp_path / f".a.{'0' * 16}.sst-graph-partial"
     named_alike = tmp_path / ".a.notes.sst-graph-partial"
@@ -429,3 +448,44 @@ def test_a_folder_of_many_files_is_swept(tmp_path: Path) -> None:
         assert sorted(tmp_path.iterdir()) == sorted([living, *others])
     sweep_folder(tmp_path)
     assert sorted(tmp_path.iterdir()) == sorted(others)
+
+
+def test_a_sweep_leaves_what_another_is_writing(tmp_path: Path) -> None:
+    """Also in the instants before a file is locked, and before it has its name."""
+    over = threading.Event()
+
+    def sweep() -> None:
+        while not over.is_set():
+            sweep_folder(tmp_path)
+
+    sweeping = threading.Thread(target=sweep)
+    sweeping.start()
+    try:
+        for number in range(3000):
+            atomic_write_bytes(tmp_path / "a", str(number).encode())
+            for _ in atomic_write_in_steps(tmp_path / "b", lambda stream: iter([stream.write(b"b")])):
+                pass
+    finally:
+        over.set()
+        sweeping.join()
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"a": "2999", "b": "b"}
+
+
+@pytest.mark.parametrize("size", ["1e999", "Infinity", "1" + "0" * 5000, "null", "[" * 200_000, "fifo"])
+def test_a_manifest_that_cannot_be_used_is_none(tmp_path: Path, size: str) -> None:
+    """No error of another kind, and nothing that blocks."""
+    with atomic_directory(tmp_path / "out", False, KIND) as folder:
+        (folder / "a").write_text("one")
+    path = tmp_path / "out" / MANIFEST
+    text = path.read_text()
+    path.unlink()
+    if size == "fifo":
+        os.mkfifo(path)
+    else:
+        path.write_text(text.replace("3,", f"{size},", 1))
+    with (
+        pytest.raises(ConfigError, match="found a folder without"),
+        atomic_directory(tmp_path / "out", True, KIND),
+    ):
+        pass
+    assert (tmp_path / "out" / "a").read_text() == "one"

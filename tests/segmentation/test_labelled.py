@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from tiny_networks import colour_yaml, range_yaml, write_colour_network, write_range_network
 
+from sst_graph.cli.labels import store_to_fill
 from sst_graph.data import open_source
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.errors import ConfigError, DataError
@@ -255,3 +256,18 @@ def test_a_run_that_is_killed_goes_on_where_it_was(kitti_drive: Path, tmp_path: 
     assert done.returncode == 0, done.stderr
     assert f"{5 - made} labels made, {made} found" in done.stdout
     assert len(list((tmp_path / "labels").glob("images/*/*.png"))) == 5
+
+
+def test_a_run_that_ended_before_its_first_label_is_gone_on_from(tmp_path: Path) -> None:
+    """A kill, or a full disk, after the folders were made and before ``model.json`` had its name."""
+    place = tmp_path / "images" / "0123456789abcdef"
+    place.mkdir(parents=True)
+    (place / ".model.json.0123456789abcdef.sst-graph-partial").write_text("{")
+    assert store_to_fill(tmp_path).folder == tmp_path
+    (place / "000000.png").write_bytes(b"a picture of somebody")
+    with pytest.raises(ConfigError, match="found a folder of other things"):
+        store_to_fill(tmp_path)
+    (place / "000000.png").unlink()
+    (tmp_path / "velodyne").mkdir()
+    with pytest.raises(ConfigError, match="found a folder of other things"):
+        store_to_fill(tmp_path)

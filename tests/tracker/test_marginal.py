@@ -65,6 +65,16 @@ def test_the_parts_together_are_the_whole(
     assert np.linalg.slogdet(whole.information)[1] > np.linalg.slogdet(first.information)[1] + 1.0
 
 
+def test_parts_without_news_are_fused_as_well() -> None:
+    """What they add is rounding of either sign, whose entries beside the diagonal may be the larger ones."""
+    for seed in range(20):
+        whole, first = _far(seed), _far(seed + 100)
+        more = increment(whole, first)
+        nothing = increment(whole, first.plus(more))  # type: ignore[arg-type]
+        fused = fuse_marginals([first, more, nothing], significance=0.0)
+        assert fused.cTl.equals(whole.cTl, 1e-6)
+
+
 def test_in_a_graph_of_one_s_own(marginals: tuple[TrackedMarginal, list[TrackedMarginal], Tracker]) -> None:
     """As factors of gtsam, added one after the other: the answer and its covariance are the tracker's."""
     first, parts, tracker = marginals

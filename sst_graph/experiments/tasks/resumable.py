@@ -106,8 +106,13 @@ def _records(work: Work[T, R]) -> Iterator[tuple[_Rows[R], set[str], Callable[[s
         write(json.dumps(record).encode() + b"\n")
 
     def write(line: bytes) -> None:
-        file.write(line)
-        os.fsync(file.fileno())
+        try:
+            while line:  # what a full disk has no room for is written with the next call, or an error
+                line = line[file.write(line) :]
+            os.fsync(file.fileno())
+        except OSError as error:
+            error.filename = work.records
+            raise
 
     with file:
         if not lock_file(file.fileno()):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import resource
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -136,6 +137,22 @@ def test_errors_of_processes(tmp_path: Path) -> None:
         rows_of(work(path, jobs=2), [[Task(1), Task(666)], [Task(3)]])
     RUNS.clear()
     assert run(path, 1, 3) == [Row(1.0, "1"), Row(9.0, "3")] and RUNS == []
+
+
+def test_a_full_disk_is_an_error_that_names_the_file(tmp_path: Path) -> None:
+    """The system then writes the beginning of a line without an error."""
+    RUNS.clear()
+    path = tmp_path / "records"
+    run(path, 2)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 30, hard))
+    try:
+        with pytest.raises(OSError) as caught:
+            run(path, 2, 3)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert caught.value.filename == str(path)
+    assert run(path, 2, 3) == [Row(4.0, "2"), Row(9.0, "3")] and RUNS == [2, 3, 3]
 
 
 @pytest.mark.parametrize(
