@@ -111,7 +111,11 @@ class BlurredScore:
         paired = edges.paired(state)
         if paired is None:
             return None
-        known = [k for k, each in enumerate(paired.contours) if isinstance(each, PictureGradients)]
+        known = [
+            k
+            for k, (each, count) in enumerate(zip(paired.contours, paired.counts.tolist(), strict=True))
+            if count and isinstance(each, PictureGradients)
+        ]
         group = paired.repeated(np.arange(len(paired.contours)))
         paired_index = np.flatnonzero(np.isin(group, known))
         paired, group = paired.take(paired_index), group[paired_index]

@@ -17,6 +17,7 @@ from sst_graph.edges.agreement import BlurredScore
 from sst_graph.graph.matching import DriveEdges
 from sst_graph.graph.state import State
 from sst_graph.metrics import turn_rad
+from sst_graph.sampling import evenly_spread
 from sst_graph.stepwise import Stepwise
 from sst_graph.types import FloatArray
 
@@ -27,8 +28,8 @@ _STAGES = ((14.0, 1.0, 100), (8.0, 0.5, 40), (6.0, 0.25, 30))
 on."""
 GRID_DEG = 1.2
 """Step of the first grid: with KITTI's camera, as many pixels as the first blur has [deg]."""
-_POINTS = 4000
-"""Boundary points, in all, that the poses are compared on."""
+_SCANS, _POINTS = 100, 4000
+"""Scans, and boundary points in all, that the poses are compared on."""
 _WIDTH_PX = 1242
 """Image width for which the blurs are given."""
 MODES = 6
@@ -77,7 +78,7 @@ class SearchRegion:
 def edge_starts_steps(edges: DriveEdges, region: SearchRegion) -> Stepwise[list[State]]:
     """The best poses that are :data:`APART_DEG` or :data:`APART_S` apart, best first; none where nothing is
     in view."""
-    edges = edges.thinned(_POINTS)
+    edges = _of_some_scans(edges).thinned(_POINTS)
     first = _gated(_grid(region), region)
     candidates = [(number, first) for number in range(len(region.time_offsets_s))]
     found: list[tuple[float, int, FloatArray]] = []
@@ -100,6 +101,13 @@ def edge_starts_steps(edges: DriveEdges, region: SearchRegion) -> Stepwise[list[
         if all(_apart(start, other) for other in starts):
             starts.append(start)
     return starts[:MODES]
+
+
+def _of_some_scans(edges: DriveEdges) -> DriveEdges:
+    """The points of scans that are spread over the drive: the fields of each image take memory."""
+    some = evenly_spread(sorted(set(edges.scans)), _SCANS)
+    chosen = np.isin(edges.scans, some)
+    return edges if chosen.all() else edges.take(np.flatnonzero(chosen[edges.group_of]))
 
 
 def _scored(
