@@ -58,10 +58,24 @@ def other_signature(
 
 def checked_gtsam(what: str, value: Any, kind: type) -> None:
     """Nothing, where ``value`` is of this class of gtsam, and its numbers are finite where it is a pose or a
-    rotation."""
+    rotation, which gtsam makes of any matrix."""
     checked_type(what, value, kind, f"a gtsam.{kind.__name__}")
-    if isinstance(value, gtsam.Pose3 | gtsam.Rot3) and not np.isfinite(value.matrix()).all():
+    if not isinstance(value, gtsam.Pose3 | gtsam.Rot3):
+        return
+    matrix = value.matrix()
+    if not np.isfinite(matrix).all():
         raise FactorError(what, f"a {kind.__name__} that holds NaN or inf", "finite values")
+    R = matrix[:3, :3]
+    # An entry of more than 2 is none of a rotation, and its products may overflow.
+    if np.abs(R).max() > 2.0 or (off := float(np.abs(R @ R.T - _EYE).max())) > _ROTATION_TOLERANCE:
+        found = f"an entry of {np.abs(R).max():.3g}" if np.abs(R).max() > 2.0 else f"|R R' - I| = {off:.2g}"
+        raise FactorError(
+            what, f"a {kind.__name__} with {found} in its rotation", "a rotation (gtsam.Rot3.ClosestTo)"
+        )
+
+
+_EYE, _ROTATION_TOLERANCE = np.eye(3), 1e-3
+"""Largest entry of R R' - I that is put down to rounding in a file."""
 
 
 def checked_array(what: str, value: ArrayLike, shape: tuple[int | None, ...]) -> FloatArray:

@@ -192,7 +192,12 @@ class CalibrationMarginal(ByValue):
         )
 
     def shares_point(self, other: CalibrationMarginal) -> bool:
-        """Whether both are linearized at the very same point."""
+        """Whether both are linearized at the very same point.
+
+        Raises:
+            FactorError: something else than a marginal.
+        """
+        checked_type("the other marginal", other, CalibrationMarginal, "a CalibrationMarginal")
         return self.time_offset_s == other.time_offset_s and self.cTl.equals(other.cTl, 0.0)
 
     def to_json(self, E_key: int = EXTRINSIC, D_key: int = TIME_OFFSET) -> str:

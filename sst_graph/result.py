@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 
 from sst_graph.errors import DataError
-from sst_graph.factors.arguments import checked_type
+from sst_graph.factors.arguments import as_numbers, checked_gtsam, checked_number, checked_type, described
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.files.checked_values import (
     check_covariance,
@@ -160,9 +160,15 @@ class CalibrationResult:
 
     def __post_init__(self) -> None:
         check_status(self.status)
-        checked_type("T_camera_lidar", self.T_camera_lidar, gtsam.Pose3, "a gtsam.Pose3")
+        checked_gtsam("T_camera_lidar", self.T_camera_lidar, gtsam.Pose3)
         checked_type("camera", self.camera, PinholeCamera, "a PinholeCamera")
         checked_type("camera_name", self.camera_name, str, "a text")
+        checked_type("method", self.method, str, "the name of a method")
+        if self.initial is not None:
+            checked_gtsam("initial", self.initial, gtsam.Pose3)
+        checked_number("initial_time_offset_s", self.initial_time_offset_s)
+        for name in ("fit", "edges_fit"):
+            checked_type(name, getattr(self, name), (Fit, type(None)), "a Fit, or None")
         for name, kind in _SEVERAL.items():
             several = getattr(self, name)
             checked_type(name, several, (tuple, list), f"a tuple of {kind.__name__}")
@@ -170,8 +176,7 @@ class CalibrationResult:
                 checked_type(f"one of {name}", one, kind, f"a {kind.__name__}")
         for name in ("config", "read_as", "diagnostics", "versions"):
             checked_type(name, getattr(self, name), Mapping, "a dict")
-        check_finite("T_camera_lidar", self.T_camera_lidar.matrix(), (4, 4))
-        check_finite("time_offset_s", np.asarray(self.time_offset_s), ())
+        check_finite("time_offset_s", as_numbers("time_offset_s", self.time_offset_s), ())
         check_finite("covariance", self.covariance, (7, 7))
         check_covariance("covariance", self.covariance, min_sigma=0.0)
         object.__setattr__(self, "covariance", read_only(self.covariance))
@@ -327,7 +332,8 @@ def check_status(status: object) -> None:
         DataError: it is none.
     """
     if not (isinstance(status, str) and status in get_args(Status)):
-        raise DataError("status", f"{status!r:.60}", "one of " + ", ".join(get_args(Status)))
+        found = f"{status!r:.60}" if isinstance(status, str) else described(status)
+        raise DataError("status", found, "one of " + ", ".join(get_args(Status)))
 
 
 def _camera(table: JsonTable) -> PinholeCamera:

@@ -16,7 +16,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.factors.arguments import checked_gtsam, checked_number
+from sst_graph.factors.arguments import checked_array, checked_gtsam, checked_number, checked_type
 from sst_graph.factors.camera import PinholeCamera
 
 FloatArray = NDArray[np.float64]
@@ -227,12 +227,22 @@ class Calibration(ByValue):
         checked_number("time_offset_s of Calibration", self.time_offset_s)
 
     def local_coordinates(self, other: Calibration) -> FloatArray:
-        """(7,) step to another: Log of the poses' difference [rad, m], difference of the offsets [s]."""
+        """(7,) step to another: Log of the poses' difference [rad, m], difference of the offsets [s].
+
+        Raises:
+            FactorError: something else than a calibration.
+        """
+        checked_type("the other calibration", other, Calibration, "a Calibration")
         xi = gtsam.Pose3.Logmap(self.cTl.between(other.cTl))
         return np.append(np.asarray(xi, dtype=np.float64), other.time_offset_s - self.time_offset_s)
 
     def retract(self, step: FloatArray) -> Calibration:
-        """The calibration a step (7,) away, as :meth:`local_coordinates` has it."""
+        """The calibration a step (7,) away, as :meth:`local_coordinates` has it.
+
+        Raises:
+            FactorError: no such step.
+        """
+        step = checked_array("step of a Calibration", step, (7,))
         return Calibration(self.cTl.retract(step[:6]), self.time_offset_s + float(step[6]))
 
     def __iter__(self) -> Iterator[Any]:
@@ -241,10 +251,19 @@ class Calibration(ByValue):
 
 @dataclass(frozen=True)
 class Guess:
-    """What is known of a calibration beforehand: an extrinsic, or None, and a time offset [s]."""
+    """What is known of a calibration beforehand: an extrinsic, or None, and a time offset [s].
+
+    Raises:
+        FactorError: no pose, or no finite number.
+    """
 
     cTl: gtsam.Pose3 | None
     time_offset_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.cTl is not None:
+            checked_gtsam("cTl of Guess", self.cTl, gtsam.Pose3)
+        checked_number("time_offset_s of Guess", self.time_offset_s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,10 +273,18 @@ class GroundTruth(ByValue):
     Attributes:
         cTl: pose of the LiDAR in the camera.
         time_offset_s: offset with the sign of :mod:`factors`, or None where it is not known.
+
+    Raises:
+        FactorError: no pose, or no finite number.
     """
 
     cTl: gtsam.Pose3
     time_offset_s: float | None
+
+    def __post_init__(self) -> None:
+        checked_gtsam("cTl of GroundTruth", self.cTl, gtsam.Pose3)
+        if self.time_offset_s is not None:
+            checked_number("time_offset_s of GroundTruth", self.time_offset_s)
 
 
 class Source(Protocol):

@@ -6,6 +6,8 @@ from collections.abc import Iterable, Sequence
 from itertools import islice
 from typing import Any
 
+import numpy as np
+
 from sst_graph.errors import DataError
 from sst_graph.types import Source
 from sst_graph.validation import checked_intrinsics
@@ -22,8 +24,9 @@ def as_sources(frames: Source | Sequence[Source]) -> list[Source]:
     """
     sources: list[Any] = [frames]
     if not _is_source(frames):
-        # What is endless is no sequence of drives.
-        sources = list(islice(frames, _MOST + 1)) if isinstance(frames, Iterable) else []
+        # What is endless is no sequence of drives, nor is an array without dimensions.
+        several = isinstance(frames, Iterable) and not isinstance(frames, np.ndarray | str | bytes)
+        sources = list(islice(frames, _MOST + 1)) if several else []
     if not sources or not all(_is_source(source) for source in sources):
         found = type(frames).__name__ if not sources else f"a sequence of {type(sources[0]).__name__}"
         raise DataError("frames to calibrate", found, "a source (open_source), a slice of one, or several")

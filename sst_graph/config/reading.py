@@ -12,9 +12,10 @@ from typing import Any, TypeVar
 
 from sst_graph.config.old_names import fixed_in, new_name
 from sst_graph.config.ranges import Range
-from sst_graph.config.settings import join, settings_fields
+from sst_graph.config.settings import expect_any_settings, join, settings_fields
 from sst_graph.config.values import MOST_OF_A_NAME, checked, shown
 from sst_graph.errors import ConfigError, DataError, SstGraphError, count_of, printable
+from sst_graph.factors.arguments import described
 from sst_graph.files.reading import SETTINGS, read_json, read_toml
 
 T = TypeVar("T")
@@ -25,8 +26,15 @@ def from_dict(cls: type[T], data: Mapping[str, Any], base: T | None = None) -> T
     nested tables too.
 
     Raises:
-        ConfigError: an unknown key, a value of a wrong type or out of its range, a missing key.
+        ConfigError: an unknown key, a value of a wrong type or out of its range, a missing key; no class of
+            settings, or no table.
     """
+    if not (isinstance(cls, type) and dataclasses.is_dataclass(cls)):
+        raise ConfigError(f"cls: found {described(cls)}, expected a class of settings")
+    if not isinstance(data, Mapping):
+        raise ConfigError(f"data: found {described(data)}, expected a dict of settings by their names")
+    if not (base is None or isinstance(base, cls)):
+        raise ConfigError(f"base: found {described(base)}, expected a {cls.__name__}, or None")
     _refuse_unknown(cls, data, cls, "")
     return _built(cls, data, "", base)
 
@@ -51,11 +59,16 @@ def with_overrides(config: T, overrides: Sequence[str]) -> T:
     Rules that span fields see all settings at once.
 
     Raises:
-        ConfigError: no ``=``, an unknown name, a wrong type or range.
+        ConfigError: no ``=``, an unknown name, a wrong type or range; no settings, or no texts.
     """
+    expect_any_settings("config", config)
+    if not isinstance(overrides, list | tuple):
+        raise ConfigError(f"overrides: found {described(overrides)}, expected a list of name=value texts")
     cls = type(config)
     changes: dict[str, Any] = {}
     for override in overrides:
+        if not isinstance(override, str):
+            raise ConfigError(f"overrides: found {described(override)} in it, expected name=value texts")
         name, equals, text = override.partition("=")
         if not equals or not name.strip():
             raise ConfigError(f"setting {shown(override)}: expected name=value, such as max_iterations=20")

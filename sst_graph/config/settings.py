@@ -12,6 +12,7 @@ from typing import Any, TypeVar, get_type_hints
 from sst_graph.config.ranges import Range, is_internal, unit_of
 from sst_graph.config.values import checked
 from sst_graph.errors import ConfigError, SstGraphError
+from sst_graph.factors.arguments import described
 
 T = TypeVar("T")
 
@@ -84,6 +85,18 @@ def expect_settings(config: T | None, cls: type[T]) -> T:
     return config
 
 
+def expect_any_settings(what: str, config: object) -> None:
+    """Refuse what is no instance of a dataclass.
+
+    Raises:
+        ConfigError: naming ``what``.
+    """
+    if isinstance(config, type) or not dataclasses.is_dataclass(config):
+        raise ConfigError(
+            f"{what}: found {described(config)}, expected settings, such as CalibrationConfig()"
+        )
+
+
 def settings_fields(cls: Any) -> tuple[tuple[dataclasses.Field[Any], Any], ...]:
     """The fields of a settings dataclass that can be given, each with its type."""
     return _fields(cls)
@@ -110,7 +123,12 @@ def walk_settings(cls: Any, where: str = "") -> Iterator[tuple[str, dataclasses.
 
 
 def to_dict(config: Any) -> dict[str, Any]:
-    """The dataclass as a JSON-able dictionary: enums by lower-case name, tuples as lists, paths as text."""
+    """The dataclass as a JSON-able dictionary: enums by lower-case name, tuples as lists, paths as text.
+
+    Raises:
+        ConfigError: no dataclass.
+    """
+    expect_any_settings("config", config)
     return {
         field.name: _plain(getattr(config, field.name))
         for field in dataclasses.fields(config)

@@ -8,6 +8,7 @@ from sst_graph.errors import ConfigError
 from sst_graph.export import chains, records, robots
 from sst_graph.export.frames import Rig, rig_of
 from sst_graph.export.options import ExportOptions
+from sst_graph.factors.arguments import checked_type, described
 from sst_graph.result import CalibrationResult
 from sst_graph.rig import RigResult
 
@@ -44,10 +45,14 @@ def export_text(
     Raises:
         ConfigError: an unknown format, or options that do not fit it or the result.
         EstimationError: a result whose covariance has no inverse (gtsam only).
+        FactorError: no result, or no options.
     """
-    if target not in FORMATS:
-        raise ConfigError(f"export format {target!r}: expected one of {', '.join(FORMATS)}")
-    options = options or ExportOptions()
+    expected = "a CalibrationResult or a RigResult"
+    checked_type("result", result, (CalibrationResult, RigResult), expected)
+    if not (isinstance(target, str) and target in FORMATS):
+        raise ConfigError(f"export format: found {described(target)}, expected one of {', '.join(FORMATS)}")
+    options = ExportOptions() if options is None else options
+    checked_type("options", options, ExportOptions, "an ExportOptions, or None")
     lidar_frame = None if options.lidar_frame == ExportOptions().lidar_frame else options.lidar_frame
     for name, value, formats in (
         ("--camera-frame", options.camera_frame, _WITH_OPTICAL_FRAMES),

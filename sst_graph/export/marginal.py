@@ -85,7 +85,11 @@ def common_errors(result: CalibrationResult) -> dict[str, FloatArray]:
 
     All results of the same two sensors err by these together. Empty where the covariance does not hold them,
     such as one that a program has put in its place.
+
+    Raises:
+        FactorError: no result.
     """
+    checked_type("result", result, CalibrationResult, "a CalibrationResult")
     errors = {name: sigma * sensitivity for name, (sigma, sensitivity) in considered_errors(result).items()}
     steps = {name: step for name, step in errors.items() if step.any()}
     return {} if own_covariance(result.covariance, steps) is None else steps

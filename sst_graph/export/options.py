@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from sst_graph.data.kitti.calib import KittiCalibration
 from sst_graph.data.ros.transforms import Transforms
 from sst_graph.errors import ConfigError
+from sst_graph.factors.arguments import checked_type
 
 _NAME = re.compile(r"/?[A-Za-z0-9_](?:[A-Za-z0-9_/.]|-(?!-))*")
 CAMERA, NUMBER = "{camera}", "{number}"
@@ -31,6 +32,10 @@ class ExportOptions:
         tree: transforms of the vehicle that hold the LiDAR's frame.
         kitti: calib.txt whose P lines say where the camera stands beside camera 0; None takes the
             camera itself for camera 0.
+
+    Raises:
+        ConfigError: names that no format can hold, or one for two frames.
+        FactorError: a name that is no text, or something else than transforms and a calibration of KITTI.
     """
 
     camera_frame: str | None = None
@@ -42,6 +47,13 @@ class ExportOptions:
     kitti: KittiCalibration | None = None
 
     def __post_init__(self) -> None:
+        for field in ("camera_frame", "camera_link", "parent", "child"):
+            what, expected = f"{field} of ExportOptions", "the name of a frame, or None"
+            checked_type(what, getattr(self, field), (str, type(None)), expected)
+        checked_type("lidar_frame of ExportOptions", self.lidar_frame, str, "the name of a frame")
+        tree, kitti = (Transforms, type(None)), (KittiCalibration, type(None))
+        checked_type("tree of ExportOptions", self.tree, tree, "Transforms, or None")
+        checked_type("kitti of ExportOptions", self.kitti, kitti, "a KittiCalibration, or None")
         for name in (self.camera_frame, self.camera_link, self.lidar_frame, self.parent, self.child):
             if name is not None and not _NAME.fullmatch(name.replace(CAMERA, "c").replace(NUMBER, "0")):
                 raise ConfigError(f"frame name {name!r}: expected letters, digits, '_', '/', '.', single '-'")

@@ -8,6 +8,7 @@ and in the length of a number, and hold finite numbers and unique keys only.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import math
@@ -69,6 +70,13 @@ def path_of(value: str | Path, expected: str) -> Path:
     path = Path(value)
     if "\0" in str(path):
         raise DataError(path, "no name of a file (a NUL character is in it)", expected)
+    try:
+        os.lstat(path)
+    except UnicodeEncodeError:
+        raise DataError(path, "no name of a file (a lone surrogate is in it)", expected) from None
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            raise DataError(path, f"a name of {count_of(len(str(path)), 'character')}", expected) from None
     return path
 
 

@@ -15,16 +15,17 @@ from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
 
-from sst_graph.config import Settings, setting
+from sst_graph.config import Settings, expect_settings, setting
 from sst_graph.covariance.observability import ObservabilityConfig
 from sst_graph.errors import ConfigError, DataError
+from sst_graph.factors.arguments import checked_type
 from sst_graph.files.json_table import json_table
 from sst_graph.files.reading import FileKind, digest_of_file
 from sst_graph.files.staging import lock_file, sweep_folder
 from sst_graph.files.strict_json import strict_json
 from sst_graph.fleet.attempt import DRIVES, RECORDS, Job, finished_record, remove_unfinished, run_drive
 from sst_graph.fleet.dask_pool import run_on_dask
-from sst_graph.fleet.drives import Drive, vehicle_files
+from sst_graph.fleet.drives import Drive, checked_drives, vehicle_files
 from sst_graph.fleet.isolated import Limits
 from sst_graph.fleet.local_pool import run_locally
 from sst_graph.fleet.places import Place, read_many
@@ -208,7 +209,13 @@ def run_batch(
     Raises:
         ConfigError: an earlier run calibrated other data under the name of a drive.
         DataError: the folder cannot be read.
+        FactorError: no drives, no place, or no such function.
     """
+    checked_drives(drives)
+    checked_type("out", out, Place, "a Place (Place.of)")
+    config = expect_settings(config, BatchConfig)
+    checked_type("progress", progress, Callable, "a function of the Progress")  # type: ignore[arg-type]
+    checked_type("run", run, Callable, "a function of a Job")  # type: ignore[arg-type]
     jobs = [Job(drive, config.options, out, os.getcwd(), config.limits, config.retries) for drive in drives]
     records = _finished(jobs, out)
     left = [job for job in jobs if job.drive.name not in records]
@@ -236,7 +243,15 @@ def write_summary(
 
     Raises:
         OSError, DataError: it cannot be written.
+        ConfigError: there is no drive.
+        FactorError: no drives, no records, or no place.
     """
+    checked_drives(drives)
+    if not drives:
+        raise ConfigError("drives: found none, expected one or more")
+    checked_type("records", records, Mapping, "a dict of records by the drive's name (run_batch)")
+    checked_type("out", out, Place, "a Place (Place.of)")
+    config = expect_settings(config, BatchConfig)
     vehicles = vehicles_of(drives, records, config.walk, config.observability)
     others = _others(drives, out)
     report = "report.md" if "--no-report" in config.options else "report.html"

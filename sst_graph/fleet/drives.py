@@ -10,8 +10,10 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from pathlib import Path
 
 from sst_graph.errors import ConfigError, DataError, count_of
+from sst_graph.factors.arguments import checked_count, checked_type
 from sst_graph.fleet.places import Place
 
 _NOT_IN_A_NAME = re.compile(r"[^\w.=+-]+")
@@ -45,6 +47,10 @@ class Drive:
         place: where its data stand.
         vehicle: whose sensors it shares with other drives; empty where that is not known.
         date: ISO 8601, UTC where it names no zone; empty where it is not known.
+
+    Raises:
+        FactorError: no place, or names that are no texts.
+        DataError: no date.
     """
 
     name: str
@@ -52,13 +58,31 @@ class Drive:
     vehicle: str = ""
     date: str = ""
 
+    def __post_init__(self) -> None:
+        for field in ("name", "vehicle", "date"):
+            checked_type(f"{field} of a Drive", getattr(self, field), str, "a text")
+        checked_type("place of a Drive", self.place, Place, "a Place (Place.of)")
+        _checked_date(self.date, f"date of the drive {self.name:.60}")
+
     @property
     def day(self) -> float | None:
         """Days since 1970, or None without a date."""
         return None if not self.date else _instant(self.date).timestamp() / 86400.0
 
 
-def find_drives(what: str, name_parts: int = 1) -> list[Drive]:
+def checked_drives(drives: Sequence[Drive]) -> None:
+    """Refuse what is no list of drives.
+
+    Raises:
+        FactorError: it is none.
+    """
+    expected = "a list of Drive (find_drives)"
+    checked_type("drives", drives, (list, tuple), expected)
+    for drive in drives:
+        checked_type("one of the drives", drive, Drive, "a Drive (find_drives)")
+
+
+def find_drives(what: str | Path, name_parts: int = 1) -> list[Drive]:
     """The drives that a folder, a pattern or a list names, in the order of the list or of their names.
 
     Of a folder they are its folders and its bags; other files that lie there are left out
@@ -74,7 +98,11 @@ def find_drives(what: str, name_parts: int = 1) -> list[Drive]:
     Raises:
         ConfigError: none are found, two have the same name, or two vehicles' files have one name.
         DataError: the list cannot be read.
+        FactorError: no name of a place, or no number of parts.
     """
+    checked_type("drives", what, (str, Path), "a folder of drives, a pattern, or a list, by its path")
+    what = str(what)
+    checked_count("name_parts", name_parts)
     if not what.strip():
         raise ConfigError("drives: found an empty name, expected a folder of drives, a pattern, or a list")
     place = Place.of(what)
@@ -114,7 +142,7 @@ def _holds(place: Place, is_folder: bool) -> bool:
     return is_folder or place.name.lower().endswith(BAGS)
 
 
-def with_vehicles(drives: Sequence[Drive], given: str) -> list[Drive]:
+def with_vehicles(drives: Sequence[Drive], given: str | Path) -> list[Drive]:
     """The drives with vehicle and date by a CSV or a regular expression.
 
     Args:
@@ -125,7 +153,11 @@ def with_vehicles(drives: Sequence[Drive], given: str) -> list[Drive]:
     Raises:
         ConfigError: no such expression, or it fits no drive; two vehicles whose files have one name.
         DataError: the CSV cannot be read, or has two rows of one drive.
+        FactorError: no drives, or no text.
     """
+    checked_drives(drives)
+    checked_type("given", given, (str, Path), "the path of a CSV, or a regular expression")
+    given = str(given)
     row_of = _by_table(given) if given.lower().endswith(".csv") else _by_expression(given)
     found = []
     for drive in drives:

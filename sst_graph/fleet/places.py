@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from sst_graph.errors import DataError, MissingDependencyError, SstGraphError, one_line
+from sst_graph.factors.arguments import checked_type
 from sst_graph.files import MANIFEST, atomic_write_bytes
 from sst_graph.files.reading import FileKind, read_file
 
@@ -37,7 +38,12 @@ class Place:
 
     @staticmethod
     def of(text: str | Path) -> Place:
-        """The place that a user names."""
+        """The place that a user names.
+
+        Raises:
+            FactorError: no path.
+        """
+        checked_type("place", text, (str, Path), "a path or a URL")
         words = os.fspath(text)
         return Place(words.rstrip("/") or "/")
 

@@ -87,7 +87,9 @@ def calibrate_rig(
         checked_type("name of a camera", name, str, "a text")
     checked_type("known", known, KnownRig, "a KnownRig, or None")
     sources = {name: as_sources(own) for name, own in cameras.items()}
-    guesses = _guesses(list(sources), initial or {}, initial_time_offsets_s or {})
+    initial = {} if initial is None else initial
+    initial_time_offsets_s = {} if initial_time_offsets_s is None else initial_time_offsets_s
+    guesses = _guesses(list(sources), initial, initial_time_offsets_s)
     config = with_method_for_cameras(expect_settings(config, CalibrationConfig), list(sources.values()))
     _check(sources, config)
     known.check(list(sources))

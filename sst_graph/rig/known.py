@@ -84,7 +84,11 @@ class KnownRig:
 
         Raises:
             ConfigError: naming the camera.
+            FactorError: no names.
         """
+        checked_type("cameras of KnownRig.check", cameras, (list, tuple), "the names of the cameras")
+        for name in cameras:
+            checked_type("cameras of KnownRig.check", name, str, "the name of a camera")
         for pose in self.poses:
             for name in (pose.camera, pose.reference):
                 if name not in cameras:
@@ -100,7 +104,15 @@ def poses_by_nominal(
 
     Raises:
         ConfigError: a camera has none.
+        FactorError: no dict of poses by the camera's name.
     """
+    checked_type("nominal", nominal, Mapping, "a dict of poses by the camera's name")
+    for name, cTl in nominal.items():
+        checked_type("name of a camera", name, str, "a text")
+        if cTl is not None:
+            checked_gtsam(f"nominal of {name:.60}", cTl, gtsam.Pose3)
+    if not nominal:
+        raise ConfigError("nominal: found no camera, expected one or more")
     missing = [name for name, cTl in nominal.items() if cTl is None]
     if missing:
         raise ConfigError(f"camera {missing[0]!r}: the data bring no nominal extrinsic, expected one of each")

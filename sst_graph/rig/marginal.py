@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import gtsam
 import numpy as np
 
-from sst_graph.errors import ConfigError
+from sst_graph.errors import ConfigError, count_of
 from sst_graph.factors import FactorError
-from sst_graph.factors.arguments import checked_type, described
+from sst_graph.factors.arguments import checked_array, checked_gtsam, checked_number, checked_type, described
 from sst_graph.factors.custom.variables import checked_keys
 from sst_graph.graph.linear import information_inverse, quadratic_factor
 from sst_graph.graph.state import time_offset_key
@@ -53,12 +53,33 @@ class RigMarginal(ByValue):
         extrinsics: cTl of each.
         time_offsets_s: of each [s].
         covariance: (7 n, 7 n), camera by camera [rot rad, trans m, offset s], right perturbations.
+
+    Raises:
+        FactorError: not one pose and one finite offset a name, or a covariance of another shape.
     """
 
     names: tuple[str, ...]
     extrinsics: tuple[gtsam.Pose3, ...]
     time_offsets_s: tuple[float, ...]
     covariance: FloatArray
+
+    def __post_init__(self) -> None:
+        of = "of RigMarginal"
+        checks: dict[str, Callable[[str, Any], object]] = {
+            "names": lambda what, name: checked_type(what, name, str, "the name of a camera"),
+            "extrinsics": lambda what, cTl: checked_gtsam(what, cTl, gtsam.Pose3),
+            "time_offsets_s": checked_number,
+        }
+        for field, check in checks.items():
+            several = getattr(self, field)
+            checked_type(f"{field} {of}", several, (tuple, list), "a tuple, one for each camera")
+            if len(several) != len(self.names):
+                found = count_of(len(several), "entry", "entries")
+                raise FactorError(f"{field} {of}", found, f"{len(self.names)}, one for each camera")
+            for one in several:
+                check(f"{field} {of}", one)
+        n = UNKNOWNS * len(self.names)
+        object.__setattr__(self, "covariance", checked_array(f"covariance {of}", self.covariance, (n, n)))
 
     def keys(self) -> dict[str, tuple[int, int]]:
         """Default keys of extrinsic and time offset by the camera's name: (E0, D0), (E1, D1), ..."""
@@ -137,7 +158,7 @@ class RigMarginal(ByValue):
         return tuple(self.relative_pose(camera, reference) for camera, reference in pairs)
 
     def _columns(self, name: str) -> list[int]:
-        if name not in self.names:
-            raise ConfigError(f"camera {name!r}: expected one of {', '.join(self.names)}")
+        if not (isinstance(name, str) and name in self.names):
+            raise ConfigError(f"camera: found {described(name)}, expected one of {', '.join(self.names)}")
         at = UNKNOWNS * self.names.index(name)
         return list(range(at, at + UNKNOWNS))

@@ -157,7 +157,12 @@ class ScanMotion:
         object.__setattr__(self, "l_velocities", velocities)
 
     def of_camera(self, cTl: gtsam.Pose3) -> CameraTwist:
-        """The camera's motion, by the extrinsic."""
+        """The camera's motion, by the extrinsic.
+
+        Raises:
+            FactorError: no pose.
+        """
+        checked_gtsam("cTl of ScanMotion.of_camera", cTl, gtsam.Pose3)
         Ad = np.asarray(cTl.AdjointMap())
         assert self.l_acceleration is not None
         return CameraTwist(Ad @ self.l_twist, Ad @ self.l_acceleration)

@@ -12,7 +12,14 @@ import numpy as np
 
 from sst_graph.errors import DataError, count_of
 from sst_graph.factors import FactorError, Vector
-from sst_graph.factors.arguments import checked_finite, checked_gtsam, checked_type
+from sst_graph.factors.arguments import (
+    checked_finite,
+    checked_gtsam,
+    checked_number,
+    checked_type,
+    described,
+    is_whole,
+)
 from sst_graph.factors.custom.variables import (
     Kind,
     Reader,
@@ -96,22 +103,44 @@ class Trajectory:
         return tuple(self._stamps)
 
     def at(self, position: int) -> tuple[int, int]:
-        """Key and stamp [ns] of the pose at a position."""
+        """Key and stamp [ns] of the pose at a position, from the end where it is negative.
+
+        Raises:
+            FactorError: there is no such position.
+        """
+        if not (is_whole(position) and -len(self) <= position < len(self)):
+            expected = f"a position among {count_of(len(self), 'pose')}"
+            raise FactorError("position in the Trajectory", described(position), expected)
         return self._keys[position], self._stamps[position]
 
     def position(self, stamp_ns: int) -> int | None:
-        """Position of the pose with just this stamp; None where there is none."""
+        """Position of the pose with just this stamp; None where there is none.
+
+        Raises:
+            DataError: no stamp.
+        """
+        stamp_ns = checked_stamp(stamp_ns, "a pose")
         at = bisect_left(self._stamps, stamp_ns)
         return at if at < len(self) and self._stamps[at] == stamp_ns else None
 
     def interval(self, true_ns: float) -> int | None:
-        """Position of the pose before a time that lies between two poses; None outside of all."""
+        """Position of the pose before a time that lies between two poses; None outside of all.
+
+        Raises:
+            FactorError: no number.
+        """
+        true_ns = _checked_time(true_ns)
         if len(self) < 2 or not self._stamps[0] <= true_ns <= self._stamps[-1]:
             return None
         return min(bisect_right(self._stamps, true_ns) - 1, len(self) - 2)
 
     def outside_s(self, true_ns: float) -> float:
-        """How far a time lies after the last pose (positive) or before the first (negative) [s]."""
+        """How far a time lies after the last pose (positive) or before the first (negative) [s].
+
+        Raises:
+            FactorError: no number.
+        """
+        true_ns = _checked_time(true_ns)
         if not self._stamps:
             return float("nan")
         late, early = true_ns - self._stamps[-1], true_ns - self._stamps[0]
@@ -136,6 +165,12 @@ class Trajectory:
 
     def _middle_s(self, position: int) -> float:
         return 5e-10 * float(self._stamps[position] + self._stamps[position + 1] - 2 * self._stamps[0])
+
+
+def _checked_time(true_ns: float) -> float:
+    """A time [ns]: whole where it is given so, for a float has not the digits of a stamp."""
+    number = checked_number("true_ns", true_ns)
+    return true_ns if type(true_ns) is int else number
 
 
 @dataclass(frozen=True)

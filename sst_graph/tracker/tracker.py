@@ -80,7 +80,9 @@ class Tracker:
         Raises:
             DataError: no camera, or no guess of two sensors on one vehicle.
             ConfigError: no settings of a tracker.
+            FactorError: something else than a decision about the sweep.
         """
+        checked_type("sweep", sweep, (SweepDecision, type(None)), "a SweepDecision, or None")
         camera = checked_intrinsics(camera)
         initial, initial_time_offset_s = checked_guess(initial, initial_time_offset_s)
         settings = expect_settings(config, TrackerConfig)
@@ -235,7 +237,10 @@ class Tracker:
             CheckpointError: no such file, not a checkpoint of this version, or one that was changed or
                 damaged.
             DataError: one of a tracker that was made with another camera, other settings or another guess.
+            FactorError: something else than a setup, or than a decision about the sweep.
         """
+        checked_type("setup", setup, (Setup, type(None)), "the setup of a tracker (Tracker.setup), or None")
+        checked_type("sweep", sweep, (SweepDecision, type(None)), "a SweepDecision, or None")
         return load_checkpoint(path, setup, sweep)
 
     # ------------------------------------------------------------------ steps

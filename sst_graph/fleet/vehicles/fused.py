@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal
 
+from sst_graph.config import expect_settings
 from sst_graph.covariance.observability import ObservabilityConfig, weak_directions
 from sst_graph.errors import EstimationError
+from sst_graph.factors.arguments import checked_type
 from sst_graph.factors.errors import FactorError
 from sst_graph.files.strict_json import strict_json
-from sst_graph.fleet.drives import Drive
+from sst_graph.fleet.drives import Drive, checked_drives
 from sst_graph.fleet.record import Numbers, Record
 from sst_graph.fleet.vehicles.changes import Finding, Findings, find_changes
 from sst_graph.fleet.vehicles.walk import DriveEstimate, Smoothed, WalkConfig, smoothed
@@ -157,7 +159,15 @@ def vehicles_of(
     config: WalkConfig,
     limits: ObservabilityConfig = _LIMITS,
 ) -> list[Vehicle]:
-    """All vehicles, by name; drives of no known vehicle are left out; arguments as of :func:`vehicle_of`."""
+    """All vehicles, by name; drives of no known vehicle are left out; arguments as of :func:`vehicle_of`.
+
+    Raises:
+        FactorError: no drives, or no records.
+    """
+    checked_drives(drives)
+    checked_type("records", records, Mapping, "a dict of records by the drive's name (run_batch)")
+    config = expect_settings(config, WalkConfig)
+    limits = expect_settings(limits, ObservabilityConfig)
     by_vehicle: dict[str, list[Drive]] = {}
     for drive in drives:
         if drive.vehicle:
