@@ -15,7 +15,7 @@ from checks import fuzz_mutations as m
 from checks.fuzz_layouts import ROOT, yaml_text
 from sst_graph import open_source, read_result, read_rig
 from sst_graph.fleet.batch import BatchConfig, write_summary
-from sst_graph.fleet.drives import Drive, find_drives, with_vehicles
+from sst_graph.fleet.drives import ListedDrive, find_drives, with_vehicles
 from sst_graph.fleet.places import Place
 from sst_graph.fleet.record import Cost, Numbers, Record
 from sst_graph.rig.known_files import read_known_poses
@@ -114,7 +114,8 @@ def batch(folder: Path, drive: Path, path: Path) -> None:
     record = Record.from_json(Place.of(path).read(), path)
     records = {name: dataclasses.replace(record, drive=name) for name in ("a", "b")}
     drives = [
-        Drive(name, Place.of(f"/drives/{name}"), "v", f"2026-01-0{k + 1}") for k, name in enumerate(records)
+        ListedDrive(name, Place.of(f"/drives/{name}"), "v", f"2026-01-0{k + 1}")
+        for k, name in enumerate(records)
     ]
     out = folder / "summary"
     shutil.rmtree(out, ignore_errors=True)

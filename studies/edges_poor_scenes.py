@@ -18,10 +18,10 @@ from sst_graph.experiments.starts import errors_of
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, scenery, simulate
 from sst_graph.simulator.mesh import box_triangles, soup
 from sst_graph.simulator.street import Street, _assembled, _Builder
-from sst_graph.simulator.surfaces import Kind, Material
+from sst_graph.simulator.surfaces import FaceKind, Material
 
 START = np.array([*np.radians([2.0, -3.0, 2.0]), 0.04, -0.04, 0.04])
-PROFILE = scenery.Profile(3.2, (4.0, 4.0), 1.5, (6.0, 6.0))
+PROFILE = scenery.StreetProfile(3.2, (4.0, 4.0), 1.5, (6.0, 6.0))
 
 
 def between_walls(builder: _Builder, rng: np.random.Generator, start: float, end: float) -> None:
@@ -29,7 +29,7 @@ def between_walls(builder: _Builder, rng: np.random.Generator, start: float, end
     piece = box_triangles((-5.2, -0.3, -1.0), (5.2, 0.3, float(rng.uniform(2.5, 6.0))))
     for side in (-1.0, 1.0):
         for s in np.arange(start, end, 10.0):
-            wall = soup(piece, Kind.BUILDING, int(Material.PAVING), (0.6, 0.6, 0.6))
+            wall = soup(piece, FaceKind.BUILDING, int(Material.PAVING), (0.6, 0.6, 0.6))
             builder.put(wall, float(s), side * 6.0)
 
 

@@ -41,7 +41,7 @@ import numpy as np
 
 from sst_graph.cli import main as main_of_program
 from sst_graph.files import MANIFEST
-from sst_graph.fleet import BatchConfig, Drive, Place, Record, write_summary
+from sst_graph.fleet import BatchConfig, ListedDrive, Place, Record, write_summary
 from sst_graph.fleet import batch as fleet_batch
 from sst_graph.fleet.attempt import Job
 from sst_graph.fleet.record import Cost, Numbers
@@ -293,7 +293,7 @@ def empty_drive(job: Job) -> Record:
 def measure_scheduler(count: int, folder: Path, workers: int, dask: str) -> None:
     """Drives that take no time, through the batch's own code; prints what it adds to each."""
     drives = [
-        Drive(
+        ListedDrive(
             f"d{k:06d}", Place(f"/data/d{k:06d}"), f"v{k % (count // 100):05d}", f"2026-01-{1 + k % 28:02d}"
         )
         for k in range(count)

@@ -25,7 +25,15 @@ from sst_graph.errors import DataError, SstGraphError
 from sst_graph.export import CalibrationMarginal, ExportOptions, common_errors, export_text
 from sst_graph.factors import FactorError
 from sst_graph.files.reading import path_of
-from sst_graph.fleet import BatchConfig, Drive, Place, find_drives, run_batch, vehicles_of, with_vehicles
+from sst_graph.fleet import (
+    BatchConfig,
+    ListedDrive,
+    Place,
+    find_drives,
+    run_batch,
+    vehicles_of,
+    with_vehicles,
+)
 from sst_graph.fleet.batch import write_summary
 from sst_graph.fleet.vehicles.walk import WalkConfig
 from sst_graph.rig.known import poses_by_nominal
@@ -34,7 +42,7 @@ from sst_graph.types import GroundTruth, Guess
 
 RIG, RIG_MARGINAL, CALIBRATION = rig_of(marginal_of(2)), marginal_of(2), Calibration(POSE, 0.1)
 MARGINAL = CalibrationMarginal(POSE, 0.1, np.eye(7), np.zeros(7))
-DRIVE = Drive("one", Place("/nowhere/one"), "van", "2026-11-01")
+DRIVE = ListedDrive("one", Place("/nowhere/one"), "van", "2026-11-01")
 POSES = Poses([1, 2], [0, 100])
 TRACKER = Tracker(CAMERA)
 NUMBER = {"int", "negative", "float"}
@@ -81,7 +89,7 @@ RIGHT: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "with_overrides": (with_overrides, {"config": CalibrationConfig(), "overrides": ["method=joint"]}),
     "from_dict": (from_dict, {"cls": CalibrationConfig, "data": {}}),
     "to_dict": (to_dict, {"config": CalibrationConfig()}),
-    "Drive": (Drive, {"name": "a", "place": Place("/a"), "vehicle": "v", "date": "2026-11-01"}),
+    "Drive": (ListedDrive, {"name": "a", "place": Place("/a"), "vehicle": "v", "date": "2026-11-01"}),
     "Place.of": (Place.of, {"text": "/a"}),
     "with_vehicles": (with_vehicles, {"drives": [DRIVE], "given": "(?P<vehicle>one)"}),
     "vehicles_of": (vehicles_of, {"drives": [], "records": {}, "config": WalkConfig()}),
@@ -172,7 +180,7 @@ def test_what_batches_refuse(tmp_path: Path) -> None:
     with pytest.raises(SstGraphError, match="drives: found none"):
         write_summary([], {}, out, config)
     with pytest.raises(DataError, match="date of the drive a: found the date 'soon'"):
-        Drive("a", out, date="soon")
+        ListedDrive("a", out, date="soon")
     (tmp_path / "one").mkdir()
     assert find_drives(tmp_path) == find_drives(str(tmp_path))
     with pytest.raises(FactorError, match="name_parts: found 0"):

@@ -10,8 +10,8 @@ from sst_graph.batch.config import CalibrationConfig
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.diagnosis import (
     Finding,
-    Fit,
     Fitter,
+    LabelFit,
     likely_causes,
     mirror,
     other_axes,
@@ -110,7 +110,7 @@ def _fault_hypotheses(
     if not result.frames_used:
         return likely_causes(drives, guess, fit)
     explained, concentration = (float(result.diagnostics[key]) for key in ("explained", "concentration"))
-    solved = Fit(result.T_camera_lidar, result.time_offset_s, explained, concentration)
+    solved = LabelFit(result.T_camera_lidar, result.time_offset_s, explained, concentration)
     if result.status == "not_converged":
         return likely_causes(drives, guess, fit, solved)
     return mirror(drives, guess, fit, solved) if explained * concentration < _AGREED else ()
@@ -119,7 +119,7 @@ def _fault_hypotheses(
 def fit_labels(config: CalibrationConfig) -> Fitter:
     """Search and short solution on a few scans of one drive, with a calibration's own settings."""
 
-    def fit(drive: Drive, guess: Guess) -> Fit | None:
+    def fit(drive: Drive, guess: Guess) -> LabelFit | None:
         motions = motions_of([drive])
         few = [replace(drive, scans=drive.scans[:: step_for(len(drive.scans), _SCANS)])]
         joint = replace(config.joint, max_outer=len(NARROW_KERNELS_PX))
@@ -134,7 +134,7 @@ def fit_labels(config: CalibrationConfig) -> Fitter:
             solution = solve_joint(problem, start, NARROW_KERNELS_PX)
         except EstimationError:
             return None
-        return Fit(
+        return LabelFit(
             solution.state.cTl,
             solution.state.time_offsets_s[0],
             explained(solution),

@@ -16,7 +16,7 @@ from sst_graph.data.frame_parts import RecentReader
 from sst_graph.files import OutputKind
 from sst_graph.inspect.inspection import inspect_result, to_dict
 from sst_graph.inspect.reasons import MOST_REASONS, short_reasons
-from sst_graph.inspect.report import OWN_CALIBRATION, Comparison, markdown_report
+from sst_graph.inspect.report import OWN_CALIBRATION, ReferenceErrors, markdown_report
 from sst_graph.metrics import calibration_errors
 from sst_graph.odometry.sweep import with_sweep_of
 from sst_graph.report import ReportInputs, report_html
@@ -32,7 +32,7 @@ PICTURES = 3
 """Overlays of a calibration, over all its drives."""
 
 
-def comparison(result: CalibrationResult, sources: Sequence[Source]) -> Comparison | None:
+def comparison(result: CalibrationResult, sources: Sequence[Source]) -> ReferenceErrors | None:
     """Errors against what the first drive knows to be true, or None."""
     truth = sources[0].truth
     if truth is None:
@@ -44,14 +44,14 @@ def comparison(result: CalibrationResult, sources: Sequence[Source]) -> Comparis
         truth,
         None if reference else result.covariance,
     )
-    return Comparison(errors, OWN_CALIBRATION if reference else "the truth")
+    return ReferenceErrors(errors, OWN_CALIBRATION if reference else "the truth")
 
 
 def write_calibration(
     folder: Path,
     result: CalibrationResult,
     sources: Sequence[Source],
-    against: Comparison | None,
+    against: ReferenceErrors | None,
     with_report: bool = True,
 ) -> list[str]:
     """Write the result's files into ``folder`` (which exists) and return their names.
@@ -68,7 +68,7 @@ def _written(
     folder: Path,
     result: CalibrationResult,
     sources: Sequence[Source],
-    against: Comparison | None,
+    against: ReferenceErrors | None,
     with_report: bool,
     progress: ProgressStage,
 ) -> list[str]:
@@ -96,7 +96,7 @@ def _written(
     return [RESULT_NAME, REPORT_NAME, "report.md", *pictures]
 
 
-def result_numbers(result: CalibrationResult, against: Comparison | None) -> dict[str, Any]:
+def result_numbers(result: CalibrationResult, against: ReferenceErrors | None) -> dict[str, Any]:
     """What ``--json`` prints of a result: pose, offset, what ``inspect --json`` prints, known errors."""
     return {
         "T_camera_lidar": result.T_camera_lidar.matrix(),

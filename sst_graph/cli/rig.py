@@ -25,7 +25,7 @@ from sst_graph.cli.video import video_of, videos_beside
 from sst_graph.errors import ConfigError, count_of
 from sst_graph.files import atomic_directory
 from sst_graph.files.strict_json import strict_json
-from sst_graph.inspect.report import Comparison, verdict_and_summary
+from sst_graph.inspect.report import ReferenceErrors, verdict_and_summary
 from sst_graph.result import RIG_NAME, result_file
 from sst_graph.rig import KnownPose, KnownRig, RelativePose, RigResult, calibrate_rig, read_rig
 from sst_graph.rig.known import ROTATION_SIGMA_DEG, TRANSLATION_SIGMA_M, poses_by_nominal
@@ -147,7 +147,7 @@ def _calibrated(
     return sources, dataclasses.replace(rig, cameras=results)
 
 
-def _mention_rig(rig: RigResult, against: Mapping[str, Comparison | None]) -> None:
+def _mention_rig(rig: RigResult, against: Mapping[str, ReferenceErrors | None]) -> None:
     for name, result in rig.cameras.items():
         mention(f"{'camera':<15} {name}\n{verdict_and_summary(result, against[name])}\n")
     mention("\n".join(f"{name:<15} {text}".rstrip() for name, text in rig_lines(rig)))

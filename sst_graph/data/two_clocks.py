@@ -71,7 +71,7 @@ class DriveProperties:
 
 
 @dataclass(frozen=True)
-class Place:
+class FramePositions:
     """Positions of a frame's scan and image among those of their sensors; one may be None."""
 
     scan: int | None
@@ -149,7 +149,7 @@ class TwoClockSource(IndexedSource):
 
     scans: Sensor[Scan]
     images: Sensor[CameraImage]
-    places: tuple[Place, ...]
+    places: tuple[FramePositions, ...]
 
     @cached_property
     def scan_positions(self) -> list[int]:
@@ -251,12 +251,14 @@ def merged(
     return TwoClockSource(properties, _selected(places, options), scans, images, places)
 
 
-def _places(scan_stamps_ns: NDArray[np.int64], image_stamps_ns: NDArray[np.int64]) -> tuple[Place, ...]:
+def _places(
+    scan_stamps_ns: NDArray[np.int64], image_stamps_ns: NDArray[np.int64]
+) -> tuple[FramePositions, ...]:
     """Scans and images in the order of their stamps, those of equal stamps together."""
     stamps = np.union1d(scan_stamps_ns, image_stamps_ns)
     scan_at = {int(stamp): k for k, stamp in enumerate(scan_stamps_ns)}
     image_at = {int(stamp): k for k, stamp in enumerate(image_stamps_ns)}
-    return tuple(Place(scan_at.get(stamp), image_at.get(stamp)) for stamp in stamps.tolist())
+    return tuple(FramePositions(scan_at.get(stamp), image_at.get(stamp)) for stamp in stamps.tolist())
 
 
 def _shifted(images: Sensor[CameraImage], shift: int) -> tuple[Sensor[CameraImage], float]:
@@ -287,7 +289,7 @@ class _Shifted:
         return replace(self.images.read(self.first + k), stamp_ns=int(self.stamps_ns[k]))
 
 
-def _selected(places: tuple[Place, ...], options: SourceOptions) -> tuple[int, ...]:
+def _selected(places: tuple[FramePositions, ...], options: SourceOptions) -> tuple[int, ...]:
     chosen = options.frames or slice(None)
     first, last = chosen.start or 0, len(places) if chosen.stop is None else chosen.stop
     if first >= len(places) or last > len(places):

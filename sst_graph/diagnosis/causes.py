@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from sst_graph.diagnosis import cameras, clocks, labels, repeats, units
 from sst_graph.diagnosis.finding import Finding
-from sst_graph.diagnosis.fit import LEAST_QUALITY, WELL, Fit, Fitter
+from sst_graph.diagnosis.fit import LEAST_QUALITY, WELL, Fitter, LabelFit
 from sst_graph.diagnosis.hypotheses import best_hypothesis, mirrored
 from sst_graph.diagnosis.poses import wrong_start
 from sst_graph.drive.preparation import Drive
@@ -36,7 +36,7 @@ def preflight(drives: Sequence[Drive], guess: Guess, classes: Sequence[SemanticC
 
 
 def likely_causes(
-    drives: Sequence[Drive], guess: Guess, fit: Fitter, result: Fit | None = None
+    drives: Sequence[Drive], guess: Guess, fit: Fitter, result: LabelFit | None = None
 ) -> tuple[Finding, ...]:
     """Why the labels do not agree, for a result that is missing or may be wrong; empty where they do agree.
 
@@ -61,7 +61,7 @@ def likely_causes(
     return () if cause is None else (cause,)
 
 
-def mirror(drives: Sequence[Drive], guess: Guess, fit: Fitter, result: Fit) -> tuple[Finding, ...]:
+def mirror(drives: Sequence[Drive], guess: Guess, fit: Fitter, result: LabelFit) -> tuple[Finding, ...]:
     """Whether mirrored data would agree better, for a result without any other reason against it.
 
     Args:
@@ -73,7 +73,7 @@ def mirror(drives: Sequence[Drive], guess: Guess, fit: Fitter, result: Fit) -> t
     return () if cause is None else (cause,)
 
 
-def _nothing_in_common(given: Fit | None) -> Finding:
+def _nothing_in_common(given: LabelFit | None) -> Finding:
     found = (
         "nothing" if given is None else f"a place where {100.0 * given.explained:.0f} % of the outlines meet"
     )

@@ -29,7 +29,7 @@ that is flipped on one."""
 
 
 @dataclass(frozen=True)
-class Fit:
+class LabelFit:
     """How well the labels of both sensors agree after a search and a short solution.
 
     Attributes:
@@ -49,5 +49,5 @@ class Fit:
         return self.explained * self.concentration
 
 
-Fitter = Callable[[Drive, Guess], Fit | None]
+Fitter = Callable[[Drive, Guess], LabelFit | None]
 """Searches around a guess; None where nothing is found."""

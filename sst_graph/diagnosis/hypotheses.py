@@ -23,8 +23,8 @@ from sst_graph.diagnosis.fit import (
     THERE_DEG,
     THERE_GAIN,
     WELL,
-    Fit,
     Fitter,
+    LabelFit,
 )
 from sst_graph.diagnosis.poses import start_finding
 from sst_graph.drive.preparation import Drive, ScanFeatures
@@ -58,7 +58,7 @@ _WINDOW_S = 0.9
 """Width of a window [s]: the search reaches half a second either way."""
 
 
-def best_hypothesis(drive: Drive, guess: Guess, fit: Fitter, given: Fit | None) -> Finding | None:
+def best_hypothesis(drive: Drive, guess: Guess, fit: Fitter, given: LabelFit | None) -> Finding | None:
     """The change under which the labels agree, where they clearly do; None where none helps.
 
     All changes are compared, for a wrong one may fit well by chance; shifts in time only where none does.
@@ -71,11 +71,11 @@ def best_hypothesis(drive: Drive, guess: Guess, fit: Fitter, given: Fit | None) 
 
 
 def _best(
-    tried: Iterator[Hypothesis], guess: Guess, fit: Fitter, given: Fit | None, enough: float = np.inf
+    tried: Iterator[Hypothesis], guess: Guess, fit: Fitter, given: LabelFit | None, enough: float = np.inf
 ) -> tuple[float, Finding] | None:
     """Quality, higher where the labels agree just there, and cause of the best change that is accepted; none
     is tried after one of ``enough``."""
-    base = Fit(gtsam.Pose3(), 0.0, 0.0, 0.0) if given is None else given
+    base = LabelFit(gtsam.Pose3(), 0.0, 0.0, 0.0) if given is None else given
     given_quality = base.quality * (THERE_GAIN if _is_there(base, guess) else 1.0)
     best: tuple[float, Finding] | None = None
     for hypothesis in tried:
@@ -106,7 +106,7 @@ def _best(
     return best
 
 
-def _is_there(found: Fit, guess: Guess) -> bool:
+def _is_there(found: LabelFit, guess: Guess) -> bool:
     """Whether the labels agree just where a guess says."""
     if guess.cTl is None:
         return False
@@ -138,7 +138,7 @@ def _that_meet_images(drive: Drive, time_offset_s: float) -> tuple[ScanFeatures,
     return tuple(drive.scans[pair.scan] for pair in pairs)
 
 
-def mirrored(drive: Drive, guess: Guess, fit: Fitter, given: Fit, sideways: bool) -> Finding | None:
+def mirrored(drive: Drive, guess: Guess, fit: Fitter, given: LabelFit, sideways: bool) -> Finding | None:
     """Clouds or pictures that are mirrored: the only mistake with which an estimate may still have the status
     ``ok``.
 

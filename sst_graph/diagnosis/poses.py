@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sst_graph.diagnosis.finding import Finding
-from sst_graph.diagnosis.fit import Fit
+from sst_graph.diagnosis.fit import LabelFit
 from sst_graph.metrics import quaternion_angle_deg
 from sst_graph.types import FloatArray
 
@@ -29,7 +29,7 @@ _SIDEWAYS = 0.9
 """Cosine to the camera's x axis."""
 
 
-def wrong_start(guess: gtsam.Pose3, free: Fit | None) -> Finding | None:
+def wrong_start(guess: gtsam.Pose3, free: LabelFit | None) -> Finding | None:
     """A start that is turned farther away from where the labels agree than is searched around it.
 
     Args:
@@ -49,7 +49,7 @@ def wrong_start(guess: gtsam.Pose3, free: Fit | None) -> Finding | None:
     return start_finding(guess, free, general)
 
 
-def start_finding(guess: gtsam.Pose3, found: Fit, finding: Finding) -> Finding:
+def start_finding(guess: gtsam.Pose3, found: LabelFit, finding: Finding) -> Finding:
     """The finding, unless the start's angles were just taken in the wrong unit."""
     for factor, unit, other in (
         (np.pi / 180.0, "radians", "degrees"),

@@ -93,7 +93,7 @@ class AccuracyConfig(Settings):
 
 
 @dataclass(frozen=True)
-class Outcome:
+class AccuracyRun:
     """One run: its errors against the truth, its status, whether it failed."""
 
     errors: CalibrationErrors
@@ -111,7 +111,7 @@ def run(config: AccuracyConfig, progress: Progress | None = None) -> str:
         raise ConfigError(f"accuracy is about the joint method, found {config.calibration.method}")
     rows = []
     for name in config.scenarios:
-        outcomes: list[Outcome] = []
+        outcomes: list[AccuracyRun] = []
         for street in range(config.streets):
             outcomes += _street(SCENARIOS[name], config, config.seed + street)
             if progress is not None:
@@ -120,7 +120,7 @@ def run(config: AccuracyConfig, progress: Progress | None = None) -> str:
     return table(_HEADER, rows)
 
 
-def _street(scenario: Scenario, config: AccuracyConfig, seed: int) -> list[Outcome]:
+def _street(scenario: Scenario, config: AccuracyConfig, seed: int) -> list[AccuracyRun]:
     """Every start on one street; the data are prepared once."""
     settings: dict[str, Any] = {"label_noise": config.label_noise, **scenario.drive}
     drive = simulate(SimulationConfig(seed=seed, **settings))
@@ -132,7 +132,7 @@ def _street(scenario: Scenario, config: AccuracyConfig, seed: int) -> list[Outco
         start = start_near(drive.truth.cTl, config.start_deg, config.start_m, rng) if scenario.guess else None
         result = calibrate_prepared(prepared, start, calibration)
         errors = errors_of(result, drive.truth)
-        outcomes.append(Outcome(errors, result.status, errors.qad_deg > config.failed_deg))
+        outcomes.append(AccuracyRun(errors, result.status, errors.qad_deg > config.failed_deg))
     return outcomes
 
 
@@ -143,7 +143,7 @@ _HEADER = (
 )
 
 
-def _row(scenario: Scenario, outcomes: Sequence[Outcome]) -> list[str]:
+def _row(scenario: Scenario, outcomes: Sequence[AccuracyRun]) -> list[str]:
     """A row; medians and percentiles are over all runs, failed ones included."""
     failed = [outcome for outcome in outcomes if outcome.failed]
     silent = sum(outcome.status == "ok" for outcome in failed)

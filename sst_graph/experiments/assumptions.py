@@ -79,7 +79,7 @@ class AssumptionTableConfig(Settings):
 
 
 @dataclass(frozen=True)
-class Run:
+class AssumptionRun:
     """One calibration of one street.
 
     Attributes:
@@ -123,7 +123,7 @@ def run(config: AssumptionTableConfig, progress: Progress | None = None) -> str:
     return table(list(runs_of(config, progress)), config.in_sigmas)
 
 
-def runs_of(config: AssumptionTableConfig, progress: Progress | None) -> Iterator[Run]:
+def runs_of(config: AssumptionTableConfig, progress: Progress | None) -> Iterator[AssumptionRun]:
     """All calibrations of the table: street by street, each simulated once."""
     cases = [
         (name, sign * size)
@@ -146,7 +146,7 @@ def runs_of(config: AssumptionTableConfig, progress: Progress | None) -> Iterato
                 progress("assumptions", number * len(cases) + done + 1, config.streets * len(cases))
 
 
-def _deviations(clean: Run) -> dict[str, float]:
+def _deviations(clean: AssumptionRun) -> dict[str, float]:
     """Of the parameters that a clean street determines, by name."""
     return {
         name: sigma
@@ -166,7 +166,9 @@ def _broken(street: SimulatedDrive, kept: KeptDrive, case: str, size: float) -> 
     return with_line_delay(street, kept, size) if case == "line_delay" else WRONG[case](kept, size)
 
 
-def _calibrated(drive: KeptDrive, case: tuple[int, str, float], config: AssumptionTableConfig) -> Run:
+def _calibrated(
+    drive: KeptDrive, case: tuple[int, str, float], config: AssumptionTableConfig
+) -> AssumptionRun:
     settings = config.calibration
     result = calibrate_prepared(prepare_drives([drive], settings), drive.nominal, settings)
     assert drive.truth is not None
@@ -179,10 +181,10 @@ def _calibrated(drive: KeptDrive, case: tuple[int, str, float], config: Assumpti
     }
     against = [name for name in estimates if report[name]["contradicted"]]
     against.sort(key=lambda name: -abs(estimates[name][0]) / estimates[name][1])
-    return Run(*case, result.status, error, result.covariance, estimates, tuple(against))
+    return AssumptionRun(*case, result.status, error, result.covariance, estimates, tuple(against))
 
 
-def table(runs: Sequence[Run], in_sigmas: bool = False) -> str:
+def table(runs: Sequence[AssumptionRun], in_sigmas: bool = False) -> str:
     """The table of some runs, with a summary below.
 
     A row holds the runs of one size, or with ``in_sigmas`` those of one size over its deviation.
@@ -196,7 +198,7 @@ def table(runs: Sequence[Run], in_sigmas: bool = False) -> str:
         if one.case == CLEAN
         for name, (_, sigma) in one.estimates.items()
     }
-    rows: dict[tuple[str, float], list[Run]] = {}
+    rows: dict[tuple[str, float], list[AssumptionRun]] = {}
     for one in runs:
         size = round(_told(one, sigmas), 6) if in_sigmas and one.size else abs(one.size)
         rows.setdefault((one.case, size), []).append(one)
@@ -210,12 +212,12 @@ _HEADER = (
 )
 
 
-def _told(one: Run, sigmas: Mapping[tuple[int, str], float]) -> float:
+def _told(one: AssumptionRun, sigmas: Mapping[tuple[int, str], float]) -> float:
     """Size over the deviation of its parameter on the clean street; NaN where that was not calibrated."""
     return abs(one.size) / sigmas.get((one.seed, one.case), np.nan)
 
 
-def _row(case: str, runs: Sequence[Run], sigmas: Mapping[tuple[int, str], float]) -> list[str]:
+def _row(case: str, runs: Sequence[AssumptionRun], sigmas: Mapping[tuple[int, str], float]) -> list[str]:
     size = float(np.median([abs(one.size) for one in runs]))
     told = np.array([_told(one, sigmas) for one in runs])
     errors = np.array([one.error for one in runs])
@@ -237,7 +239,7 @@ def _row(case: str, runs: Sequence[Run], sigmas: Mapping[tuple[int, str], float]
     ]
 
 
-def _summary(runs: Sequence[Run], sigmas: Mapping[tuple[int, str], float]) -> list[str]:
+def _summary(runs: Sequence[AssumptionRun], sigmas: Mapping[tuple[int, str], float]) -> list[str]:
     broken = [one for one in runs if one.size]
     large = [one for one in broken if _told(one, sigmas) > _TOLD_SIGMAS]
     groups = {f"sizes above {_TOLD_SIGMAS:g} σ": large, "all sizes": broken}

@@ -55,7 +55,7 @@ class ConsistencyConfig(Settings):
 
 
 @dataclass(frozen=True)
-class Run:
+class ConsistencyRun:
     """Error and claim of one run.
 
     Attributes:
@@ -87,7 +87,7 @@ def run(
 ) -> str:
     """A Markdown table, one row for every kind of drive and one for all; ``drives`` as :data:`DRIVES`."""
     rows = []
-    everything: list[Run] = []
+    everything: list[ConsistencyRun] = []
     for name in config.drives:
         title, drive = drives[name]
         runs = []
@@ -102,7 +102,7 @@ def run(
     return table(_HEADER, rows)
 
 
-def _run(drive: Mapping[str, Any], seed: int, config: ConsistencyConfig) -> Run:
+def _run(drive: Mapping[str, Any], seed: int, config: ConsistencyConfig) -> ConsistencyRun:
     simulated = simulate(SimulationConfig(seed=seed, label_noise=config.label_noise, **drive))
     prepared = prepare_drives([simulated], config.calibration)
     rng = np.random.default_rng([seed, 11])
@@ -110,7 +110,9 @@ def _run(drive: Mapping[str, Any], seed: int, config: ConsistencyConfig) -> Run:
     result = calibrate_prepared(prepared, start, config.calibration)
     error = error_of(result.calibration, simulated.truth)
     not_converged = result.status == "not_converged" or not result.frames_used
-    return Run(error, result.covariance, not_converged, offset_observable=drive["motion"] != "standing")
+    return ConsistencyRun(
+        error, result.covariance, not_converged, offset_observable=drive["motion"] != "standing"
+    )
 
 
 _HEADER = (
@@ -121,7 +123,7 @@ _HEADER = (
 _PARTS = {"rotation": slice(0, 3), "translation": slice(3, 6), "time offset": slice(6, 7), "all": slice(0, 7)}
 
 
-def row(title: str, runs: Sequence[Run], lost_deg: float) -> list[str]:
+def row(title: str, runs: Sequence[ConsistencyRun], lost_deg: float) -> list[str]:
     """A row of the table: runs that did not converge and wrong ones are counted and left out of the means."""
     claimed = [r for r in runs if not r.not_converged]
     kept = [r for r in claimed if np.degrees(np.linalg.norm(r.error[:3])) < lost_deg]

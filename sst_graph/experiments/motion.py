@@ -71,7 +71,7 @@ class MotionTableConfig(Settings):
 
 
 @dataclass(frozen=True)
-class Outcome:
+class MotionRun:
     """One run: what was run, its errors against the truth, its status, the seconds of its estimate."""
 
     run: str
@@ -83,7 +83,7 @@ class Outcome:
 def run(
     config: MotionTableConfig,
     progress: Progress | None = None,
-    outcomes_of: Callable[[MotionTableConfig, str, int], list[Outcome]] | None = None,
+    outcomes_of: Callable[[MotionTableConfig, str, int], list[MotionRun]] | None = None,
 ) -> str:
     """Every run on every street of every drive, as a Markdown table of medians and worst cases.
 
@@ -93,7 +93,7 @@ def run(
     outcomes_of = outcomes_of or street_outcomes
     rows = []
     for name in config.drives:
-        outcomes: list[Outcome] = []
+        outcomes: list[MotionRun] = []
         for number in range(config.streets):
             outcomes += outcomes_of(config, name, number)
             if progress is not None:
@@ -102,7 +102,7 @@ def run(
     return table(_HEADER, rows)
 
 
-def street_outcomes(config: MotionTableConfig, name: str, number: int) -> list[Outcome]:
+def street_outcomes(config: MotionTableConfig, name: str, number: int) -> list[MotionRun]:
     """All runs on one street; the data are prepared once."""
     street = SimulationConfig(
         seed=config.seed + number, frames=config.frames, label_noise=config.label_noise, **DRIVES[name]
@@ -117,7 +117,7 @@ def street_outcomes(config: MotionTableConfig, name: str, number: int) -> list[O
         calibration = dataclasses.replace(config.calibration, **settings)
         result = calibrate_prepared([drive], start if guessed else None, calibration)
         errors = errors_of(result, source.truth)
-        outcomes.append(Outcome(label, errors, result.status, result.diagnostics["seconds"]["estimate"]))
+        outcomes.append(MotionRun(label, errors, result.status, result.diagnostics["seconds"]["estimate"]))
     return outcomes
 
 
@@ -128,7 +128,7 @@ _HEADER = (
 )
 
 
-def _row(name: str, label: str, outcomes: Sequence[Outcome]) -> list[str]:
+def _row(name: str, label: str, outcomes: Sequence[MotionRun]) -> list[str]:
     errors = [outcome.errors for outcome in outcomes]
     return [
         name,

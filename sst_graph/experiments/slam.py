@@ -91,7 +91,7 @@ class SlamConfig(Settings):
 
 
 @dataclass(frozen=True)
-class Street:
+class SlamRun:
     """One street's outcome.
 
     Attributes:
@@ -107,7 +107,7 @@ class Street:
 
 def run(config: SlamConfig, progress: Progress | None = None) -> str:
     """Medians over the streets as a Markdown table, and how often both together are better."""
-    streets: list[Street] = []
+    streets: list[SlamRun] = []
     for weather in config.weathers:
         for number in range(config.streets):
             streets.append(solve_street(config, weather, config.seed + number))
@@ -116,7 +116,7 @@ def run(config: SlamConfig, progress: Progress | None = None) -> str:
     return markdown(config, streets)
 
 
-def solve_street(config: SlamConfig, weather: str, seed: int) -> Street:
+def solve_street(config: SlamConfig, weather: str, seed: int) -> SlamRun:
     """SLAM alone, calibration alone, and both, on one street."""
     street = dataclasses.replace(config.street, seed=seed, frames=config.frames, **WEATHERS[weather])
     source = simulate(dataclasses.replace(street, time_offset_s=config.time_offset_s))
@@ -140,7 +140,7 @@ def solve_street(config: SlamConfig, weather: str, seed: int) -> Street:
         "calibration alone": calibration_errors(alone.calibration, source),
         "both": trajectory_errors(both, source) | calibration_errors(found, source),
     }
-    return Street(weather, len(closures), errors)
+    return SlamRun(weather, len(closures), errors)
 
 
 def trajectory_errors(values: gtsam.Values, source: SimulatedDrive) -> dict[str, float]:
@@ -170,7 +170,7 @@ def calibration_errors(estimate: Calibration, source: SimulatedDrive) -> dict[st
     return dict(zip(list(MEASURES)[3:], map(float, sizes), strict=True))
 
 
-def markdown(config: SlamConfig, streets: Sequence[Street]) -> str:
+def markdown(config: SlamConfig, streets: Sequence[SlamRun]) -> str:
     """The table: a row for each weather and way, and one of how often both together are better."""
     rows = []
     for weather in config.weathers:
@@ -183,12 +183,12 @@ def markdown(config: SlamConfig, streets: Sequence[Street]) -> str:
     return table("| weather | | " + " | ".join(MEASURES) + " |", rows)
 
 
-def _median(streets: Sequence[Street], row: str, name: str, digits: int) -> str:
+def _median(streets: Sequence[SlamRun], row: str, name: str, digits: int) -> str:
     values = [street.errors[row][name] for street in streets if name in street.errors[row]]
     return f"{np.median(values):.{digits - 1}f}" if values else ""
 
 
-def _better(streets: Sequence[Street], name: str) -> str:
+def _better(streets: Sequence[SlamRun], name: str) -> str:
     """In how many streets both together have the smaller error than the one alone that determines it."""
     alone = "SLAM alone" if name in list(MEASURES)[:3] else "calibration alone"
     count = sum(street.errors["both"][name] < street.errors[alone][name] for street in streets)

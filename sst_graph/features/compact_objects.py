@@ -35,7 +35,7 @@ _MIN_POINTS = 6
 """Fewest points of an object."""
 
 
-class Kind(IntEnum):
+class ObjectShape(IntEnum):
     """What a group of points is, by its size."""
 
     GROUND = 0
@@ -51,7 +51,7 @@ class CompactObjects:
     Attributes:
         numbers: (n,) number of each point's object, from 1 without gaps; 0 for the ground and for what is too
             small.
-        kinds: (k + 1,) of :class:`Kind` of each object, by number; of 0: GROUND.
+        kinds: (k + 1,) of :class:`ObjectShape` of each object, by number; of 0: GROUND.
         heights_m: (n,) above ground [m].
     """
 
@@ -137,8 +137,8 @@ def _kinds(points: FloatArray, heights: FloatArray, numbers: IntArray) -> NDArra
     """(k + 1,) kind of each object by its extents."""
     some = np.flatnonzero(numbers)
     count = int(numbers.max(initial=0)) + 1
-    kinds = np.full(count, Kind.REST, np.uint8)
-    kinds[0] = Kind.GROUND
+    kinds = np.full(count, ObjectShape.REST, np.uint8)
+    kinds[0] = ObjectShape.GROUND
     if len(some) == 0:
         return kinds
     # Principal axes seen from above.
@@ -160,5 +160,7 @@ def _kinds(points: FloatArray, heights: FloatArray, numbers: IntArray) -> NDArra
     vehicle = (length < _VEHICLE_LENGTH_M) & (width < _VEHICLE_WIDTH_M) & (extent > _VEHICLE_LEAST_M)
     vehicle &= top < _MAX_HEIGHT_M - 0.2
     pole = (length < _POLE_WIDTH_M) & (height > _POLE_HEIGHT_M)
-    kinds[1:] = np.select([pole, vehicle], [Kind.POLE_LIKE, Kind.VEHICLE_LIKE], Kind.REST)
+    kinds[1:] = np.select(
+        [pole, vehicle], [ObjectShape.POLE_LIKE, ObjectShape.VEHICLE_LIKE], ObjectShape.REST
+    )
     return kinds

@@ -14,7 +14,7 @@ from sst_graph.errors import DataError, SstGraphError, printable
 from sst_graph.files import MANIFEST
 from sst_graph.files.manifest import read_manifest
 from sst_graph.files.staging import SUFFIX, claim
-from sst_graph.fleet.drives import Drive
+from sst_graph.fleet.drives import ListedDrive
 from sst_graph.fleet.isolated import Ending, Limits, has_ended, run_isolated
 from sst_graph.fleet.places import Place
 from sst_graph.fleet.record import Cost, Numbers, Record, Status, reason_of
@@ -50,7 +50,7 @@ class Job:
         retries: further attempts after a crash, or where something could not be copied.
     """
 
-    drive: Drive
+    drive: ListedDrive
     options: tuple[str, ...]
     out: Place
     folder: str

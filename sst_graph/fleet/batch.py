@@ -25,7 +25,7 @@ from sst_graph.files.staging import lock_file, sweep_folder
 from sst_graph.files.strict_json import strict_json
 from sst_graph.fleet.attempt import DRIVES, RECORDS, Job, finished_record, remove_unfinished, run_drive
 from sst_graph.fleet.dask_pool import run_on_dask
-from sst_graph.fleet.drives import Drive, checked_drives, vehicle_files
+from sst_graph.fleet.drives import ListedDrive, checked_drives, vehicle_files
 from sst_graph.fleet.isolated import Limits
 from sst_graph.fleet.local_pool import run_locally
 from sst_graph.fleet.places import Place, read_many
@@ -102,7 +102,7 @@ class Progress:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class BatchOutcome:
     """What a batch leaves.
 
     Attributes:
@@ -194,7 +194,7 @@ def _check_files(out: Place, before: Mapping[str, object], options: Sequence[str
 
 
 def run_batch(
-    drives: Sequence[Drive],
+    drives: Sequence[ListedDrive],
     out: Place,
     config: BatchConfig,
     progress: Callable[[Progress], None],
@@ -235,8 +235,8 @@ def run_batch(
 
 
 def write_summary(
-    drives: Sequence[Drive], records: dict[str, Record], out: Place, config: BatchConfig
-) -> Outcome:
+    drives: Sequence[ListedDrive], records: dict[str, Record], out: Place, config: BatchConfig
+) -> BatchOutcome:
     """Fuse the vehicles and write the summary: tables and page.
 
     Files of an earlier summary that this one has not, such as those of vehicles, are removed.
@@ -275,10 +275,10 @@ def write_summary(
     for earlier in folder.below() if folder.is_folder() else []:
         if earlier.name.endswith(".json") and earlier.name not in names.values():
             earlier.remove()
-    return Outcome(rows, vehicles, written, others)
+    return BatchOutcome(rows, vehicles, written, others)
 
 
-def _others(drives: Sequence[Drive], out: Place) -> int:
+def _others(drives: Sequence[ListedDrive], out: Place) -> int:
     """How many results of drives that are not given stand in the folder."""
     folder, given = out / DRIVES, {drive.name for drive in drives}
     there = folder.below() if folder.is_folder() else []

@@ -39,7 +39,7 @@ _DATES = (
 
 
 @dataclass(frozen=True)
-class Drive:
+class ListedDrive:
     """A drive that is to be calibrated.
 
     Attributes:
@@ -70,7 +70,7 @@ class Drive:
         return None if not self.date else _instant(self.date).timestamp() / 86400.0
 
 
-def checked_drives(drives: Sequence[Drive]) -> None:
+def checked_drives(drives: Sequence[ListedDrive]) -> None:
     """Refuse what is no list of drives.
 
     Raises:
@@ -79,10 +79,10 @@ def checked_drives(drives: Sequence[Drive]) -> None:
     expected = "a list of Drive (find_drives)"
     checked_type("drives", drives, (list, tuple), expected)
     for drive in drives:
-        checked_type("one of the drives", drive, Drive, "a Drive (find_drives)")
+        checked_type("one of the drives", drive, ListedDrive, "a Drive (find_drives)")
 
 
-def find_drives(what: str | Path, name_parts: int = 1) -> list[Drive]:
+def find_drives(what: str | Path, name_parts: int = 1) -> list[ListedDrive]:
     """The drives that a folder, a pattern or a list names, in the order of the list or of their names.
 
     Of a folder they are its folders and its bags; other files that lie there are left out
@@ -142,7 +142,7 @@ def _holds(place: Place, is_folder: bool) -> bool:
     return is_folder or place.name.lower().endswith(BAGS)
 
 
-def with_vehicles(drives: Sequence[Drive], given: str | Path) -> list[Drive]:
+def with_vehicles(drives: Sequence[ListedDrive], given: str | Path) -> list[ListedDrive]:
     """The drives with vehicle and date by a CSV or a regular expression.
 
     Args:
@@ -192,7 +192,7 @@ def vehicle_files(names: Iterable[str]) -> dict[str, str]:
     return {vehicle: name for name, vehicle in owners.items()}
 
 
-def _by_table(given: str) -> Callable[[Drive], Mapping[str, str | None]]:
+def _by_table(given: str) -> Callable[[ListedDrive], Mapping[str, str | None]]:
     known: dict[str, dict[str, str]] = {}
     for row in _rows(Place.of(given), ("drive", "vehicle")):
         place = Place.of(row["drive"])
@@ -201,13 +201,13 @@ def _by_table(given: str) -> Callable[[Drive], Mapping[str, str | None]]:
             if known.setdefault(key, row) != row:
                 raise DataError(given, f"two rows of the drive {row['drive']}", "one vehicle and one date")
 
-    def row_of(drive: Drive) -> Mapping[str, str | None]:
+    def row_of(drive: ListedDrive) -> Mapping[str, str | None]:
         return known.get(drive.name) or known.get(drive.place.whole()) or {}
 
     return row_of
 
 
-def _by_expression(given: str) -> Callable[[Drive], Mapping[str, str | None]]:
+def _by_expression(given: str) -> Callable[[ListedDrive], Mapping[str, str | None]]:
     try:
         expression = re.compile(given)
     except (re.error, OverflowError, RecursionError) as error:
@@ -218,7 +218,7 @@ def _by_expression(given: str) -> Callable[[Drive], Mapping[str, str | None]]:
         raise ConfigError(f"--vehicle-from {given!r}: found no group, expected (?P<vehicle>...)")
     group = "vehicle" if "vehicle" in names else unnamed[0]
 
-    def row_of(drive: Drive) -> Mapping[str, str | None]:
+    def row_of(drive: ListedDrive) -> Mapping[str, str | None]:
         match = expression.search(drive.place.url)
         if match is None:
             return {}
@@ -227,14 +227,14 @@ def _by_expression(given: str) -> Callable[[Drive], Mapping[str, str | None]]:
     return row_of
 
 
-def _of_list(place: Place, name_parts: int) -> list[Drive]:
+def _of_list(place: Place, name_parts: int) -> list[ListedDrive]:
     if place.name.lower().endswith(".csv"):
         drives = []
         for row in _rows(place, ("drive",)):
             drive = _named(Place.of(row["drive"]), name_parts)
             date = _checked_date(row.get("date", ""), f"{place}: {row['drive']}")
             name = file_name(row["name"]) if row.get("name") else drive.name
-            drives.append(Drive(name, drive.place, row.get("vehicle", ""), date))
+            drives.append(ListedDrive(name, drive.place, row.get("vehicle", ""), date))
         return drives
     lines = (_COMMENT.sub("", line).strip() for line in _text(place).splitlines())
     return [_named(Place.of(line), name_parts) for line in lines if line]
@@ -272,11 +272,11 @@ def _text(place: Place) -> str:
     return text
 
 
-def _named(place: Place, parts: int) -> Drive:
-    return Drive(file_name("_".join(place.url.split("/")[-parts:])), place)
+def _named(place: Place, parts: int) -> ListedDrive:
+    return ListedDrive(file_name("_".join(place.url.split("/")[-parts:])), place)
 
 
-def _check_names(drives: Sequence[Drive]) -> None:
+def _check_names(drives: Sequence[ListedDrive]) -> None:
     names = Counter(drive.name for drive in drives)
     for name, count in names.items():
         if count > 1:

@@ -95,7 +95,7 @@ class SearchConfig(Settings):
 
 
 @dataclass(frozen=True)
-class Stage:
+class SearchStage:
     """One stage of the search.
 
     Attributes:
@@ -112,13 +112,13 @@ class Stage:
     rounds: int
 
 
-COARSE = (Stage(45.0, 0.25, 80, samples=16, rounds=1),)
+COARSE = (SearchStage(45.0, 0.25, 80, samples=16, rounds=1),)
 """Stages for candidates that are then refined by silhouettes, whose convergence covers the rest."""
 FINE = (
-    Stage(45.0, 0.25, 80, samples=64, rounds=4),
-    Stage(22.0, 0.5, 40, samples=64, rounds=4),
-    Stage(10.0, 1.0, 20, samples=64, rounds=4),
-    Stage(4.0, 1.0, 12, samples=64, rounds=4),
+    SearchStage(45.0, 0.25, 80, samples=64, rounds=4),
+    SearchStage(22.0, 0.5, 40, samples=64, rounds=4),
+    SearchStage(10.0, 1.0, 20, samples=64, rounds=4),
+    SearchStage(4.0, 1.0, 12, samples=64, rounds=4),
 )
 """Stages up to the optimum of the label agreement itself."""
 
@@ -178,7 +178,7 @@ class SearchProblem:
         return inside if len(inside) else every
 
 
-def search_steps(problem: SearchProblem, stages: Sequence[Stage]) -> Stepwise[list[Candidate]]:
+def search_steps(problem: SearchProblem, stages: Sequence[SearchStage]) -> Stepwise[list[Candidate]]:
     """Candidates of several families in turn, best first in each.
 
     A family is one score with the translation near the guess's, or wherever it may be.
@@ -212,13 +212,13 @@ def search_steps(problem: SearchProblem, stages: Sequence[Stage]) -> Stepwise[li
     return [replace(candidate, score=candidate.score / cells) for candidate in found]
 
 
-def _kept(stage: Stage, problem: SearchProblem) -> int:
+def _kept(stage: SearchStage, problem: SearchProblem) -> int:
     return stage.candidates * (_WITHOUT_GUESS if problem.guess.cTl is None else 1)
 
 
 def _improve_steps(
     best: States,
-    stages: Sequence[tuple[Stage, AgreementMap]],
+    stages: Sequence[tuple[SearchStage, AgreementMap]],
     problem: SearchProblem,
     region: _Region,
     rng: np.random.Generator,
@@ -332,7 +332,7 @@ def _cross_entropy_steps(
     states: States,
     scale: FloatArray,
     region: _Region,
-    stage: Stage,
+    stage: SearchStage,
     rng: np.random.Generator,
 ) -> Stepwise[States]:
     """Each state moved to a better one nearby, sorted by score."""

@@ -21,7 +21,7 @@ from sst_graph.inspect.inspection import (
     telling_frames,
 )
 from sst_graph.inspect.planning import MOST_FRAMES as MOST_RECORDED
-from sst_graph.inspect.planning import Plan, Prediction, View
+from sst_graph.inspect.planning import Plan, Prediction, RepeatedView
 from sst_graph.inspect.planning import limits_of as limits_of_result
 from sst_graph.inspect.verdict import fit_line
 from sst_graph.result import CalibrationResult
@@ -114,7 +114,7 @@ def _by_view(inspection: Inspection, plan: Plan, axes: NDArray[np.intp]) -> str 
     if not len(differ):
         return None
 
-    def frames_like(view: View) -> str:
+    def frames_like(view: RepeatedView) -> str:
         scene = _scene(inspection.frames[view.position])
         return f"{plan.count} like frame {_frame_name(inspection, view.position)} ({scene})"
 

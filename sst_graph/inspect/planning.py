@@ -76,7 +76,7 @@ class Prediction(ByValue):
 
 
 @dataclass(frozen=True)
-class View:
+class RepeatedView:
     """A recorded frame's view, and what ``count`` of its like at other places would give.
 
     Attributes:
@@ -107,7 +107,7 @@ class Plan:
     elsewhere: Prediction
     motions: tuple[Prediction, ...]
     nearer: Prediction
-    views: tuple[View, ...]
+    views: tuple[RepeatedView, ...]
 
     @property
     def best(self) -> Prediction:
@@ -130,7 +130,7 @@ def plan_recording(result: CalibrationResult, frames: Sequence[FrameInformation]
     best = next((name for name in (motion.name for motion in motions) if name in twists), "standing")
     halved = nearer(views.mean(axis=0), result.T_camera_lidar)
     by_view = [
-        View(k, predicted(Proposal(best, _mean_information(frame.view, twists[best])), search=False))
+        RepeatedView(k, predicted(Proposal(best, _mean_information(frame.view, twists[best])), search=False))
         for k, frame in enumerate(frames)
     ]
     prior = np.zeros((7, 7))

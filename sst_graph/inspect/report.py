@@ -42,7 +42,7 @@ OWN_CALIBRATION = "the data's own calibration and stamps (a reference, not the t
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ReferenceErrors:
     """Errors against a calibration that is known.
 
     Attributes:
@@ -54,12 +54,12 @@ class Comparison:
     name: str
 
 
-def summary(result: CalibrationResult, comparison: Comparison | None = None) -> str:
+def summary(result: CalibrationResult, comparison: ReferenceErrors | None = None) -> str:
     """The result in a dozen lines: numbers with sigmas, status, unobservable directions."""
     return _lines(summary_rows(result, comparison))
 
 
-def verdict_and_summary(result: CalibrationResult, comparison: Comparison | None = None) -> str:
+def verdict_and_summary(result: CalibrationResult, comparison: ReferenceErrors | None = None) -> str:
     """The summary of a result; of one that is ok below its verdict. What makes another one not ok is the
     summary's reason already."""
     first = [("verdict", verdict(result))] if result.status == "ok" else []
@@ -75,7 +75,9 @@ def _lines(rows: Sequence[tuple[str, str]]) -> str:
     return "\n".join(lines)
 
 
-def summary_rows(result: CalibrationResult, comparison: Comparison | None = None) -> list[tuple[str, str]]:
+def summary_rows(
+    result: CalibrationResult, comparison: ReferenceErrors | None = None
+) -> list[tuple[str, str]]:
     """The lines of the summary, each as its name and its text; a line that continues another has no name."""
     rows = [
         ("status", result.status),
@@ -131,7 +133,9 @@ def error_lines(errors: CalibrationErrors) -> list[str]:
     return lines
 
 
-def markdown_report(result: CalibrationResult, comparison: Comparison | None, pictures: Sequence[str]) -> str:
+def markdown_report(
+    result: CalibrationResult, comparison: ReferenceErrors | None, pictures: Sequence[str]
+) -> str:
     """A short Markdown page; ``pictures`` are file names beside it."""
     blocks = [
         "# Calibration",

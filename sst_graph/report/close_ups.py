@@ -51,7 +51,7 @@ _SIDE_NAMES = ("left", "right", "top", "bottom")
 
 
 @dataclass(frozen=True)
-class Detection:
+class ObjectInFrame:
     """An object in one frame.
 
     Attributes:
@@ -65,7 +65,7 @@ class Detection:
     worst: bool = False
 
 
-def telling_detections(points: PointResiduals, covariance: FloatArray) -> list[Detection]:
+def telling_detections(points: PointResiduals, covariance: FloatArray) -> list[ObjectInFrame]:
     """Objects of which what is shown determines most, then those that agree least; with few of them, the same
     in other frames.
 
@@ -75,7 +75,7 @@ def telling_detections(points: PointResiduals, covariance: FloatArray) -> list[D
     leverages = _leverages(points, covariance)
     total = max(float(leverages.sum()), 1e-12)
     frames = 1 + int(points.frames.max(initial=0))
-    best: dict[tuple[int, int], tuple[float, Detection]] = {}
+    best: dict[tuple[int, int], tuple[float, ObjectInFrame]] = {}
     for own in _by_detection(points):
         shown = own[_shown(points.pixels[own], leverages[own])]
         if len(own) < _LEAST_POINTS or len(shown) < _LEAST_SHOWN:
@@ -83,10 +83,10 @@ def telling_detections(points: PointResiduals, covariance: FloatArray) -> list[D
         track, frame = int(points.tracks[own[0]]), int(points.frames[own[0]])
         key, found = (track, frame * _PARTS // frames), float(leverages[shown].sum())
         if key not in best or found > best[key][0]:
-            best[key] = found, Detection(own, float(leverages[own].sum()) / total)
+            best[key] = found, ObjectInFrame(own, float(leverages[own].sum()) / total)
     seen: set[int] = set()
-    firsts: list[Detection] = []
-    again: list[Detection] = []
+    firsts: list[ObjectInFrame] = []
+    again: list[ObjectInFrame] = []
     for (track, _), (_, detection) in sorted(best.items(), key=lambda item: -item[1][0]):
         (again if track in seen else firsts).append(detection)
         seen.add(track)
@@ -94,10 +94,10 @@ def telling_detections(points: PointResiduals, covariance: FloatArray) -> list[D
     ranked = _apart([*firsts, *again], points, parts)
     strong, others = ranked[: COUNT - _WORST], ranked[COUNT - _WORST :]
     least = sorted(others, key=lambda one: -_misfit_px(points.take(one.points)))[:_WORST]
-    return [*strong, *(Detection(one.points, one.share, True) for one in least)]
+    return [*strong, *(ObjectInFrame(one.points, one.share, True) for one in least)]
 
 
-def _apart(ranked: Sequence[Detection], points: PointResiduals, parts: IntArray) -> list[Detection]:
+def _apart(ranked: Sequence[ObjectInFrame], points: PointResiduals, parts: IntArray) -> list[ObjectInFrame]:
     """Detections that are not beside a better one in the same part (n,) of the record, which come last."""
     places = [points.pixels[one.points].mean(axis=0) for one in ranked]
     first: list[int] = []
@@ -153,7 +153,7 @@ def _leverages(points: PointResiduals, covariance: FloatArray) -> FloatArray:
 def _close_up(
     drawn: DrawnFrame,
     points: PointResiduals,
-    detection: Detection,
+    detection: ObjectInFrame,
     placements: Placements,
     result: CalibrationResult,
 ) -> str:

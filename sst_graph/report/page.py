@@ -23,7 +23,7 @@ from sst_graph.inspect.inspection_text import (
 )
 from sst_graph.inspect.misfit import DRIVING_MPS, misfits
 from sst_graph.inspect.reasons import as_sentence, capitalized, short_reasons
-from sst_graph.inspect.report import Comparison, error_lines, summary_rows
+from sst_graph.inspect.report import ReferenceErrors, error_lines, summary_rows
 from sst_graph.inspect.verdict import figure, fit_line, is_start, verdict
 from sst_graph.report.close_ups import ZOOM, close_ups
 from sst_graph.report.drawn_frame import DrawnFrame, DriveReader
@@ -105,7 +105,7 @@ class ReportInputs:
 
     result: CalibrationResult
     sources: Sequence[Source]
-    comparison: Comparison | None = None
+    comparison: ReferenceErrors | None = None
     frames: Sequence[DrawnFrame] = ()
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sst_graph.errors import DataError, count_of
 from sst_graph.segmentation.label_numbers import LabelNumbers
 from sst_graph.segmentation.onnx_network import OnnxNetwork
-from sst_graph.segmentation.picture_input import PictureInput, Placement, best_output
+from sst_graph.segmentation.picture_input import PictureInput, PictureLayout, best_output
 from sst_graph.segmentation.segmenter import ImageLabels
 from sst_graph.types import CameraImage, SemanticClass
 
@@ -125,7 +125,7 @@ class OnnxImageSegmenter:
         classes = self.model.numbers.of_outputs(len(logits), self.model.network)
         return ImageLabels(classes[best_output(logits, place)])
 
-    def _labels(self, array: NDArray[Any], place: Placement) -> NDArray[np.uint8]:
+    def _labels(self, array: NDArray[Any], place: PictureLayout) -> NDArray[np.uint8]:
         """Classes (h', w') of a map of numbers."""
         found = array.shape
         array = array.squeeze()  # of the batch and of a channel, first or last
@@ -136,7 +136,7 @@ class OnnxImageSegmenter:
             raise DataError(self.model.network, found_values, "numbers of classes (output: labels)")
         return self.model.numbers.of_labels(array.astype(np.int64), self.model.network)
 
-    def _logits(self, array: NDArray[Any], place: Placement) -> NDArray[Any]:
+    def _logits(self, array: NDArray[Any], place: PictureLayout) -> NDArray[Any]:
         """Outputs (c, h', w')."""
         if array.ndim == 4 and array.shape[0] == 1:
             if _fits(array.shape[3], array.shape[2], place) and array.shape[1] > 1:
@@ -155,7 +155,7 @@ class OnnxImageSegmenter:
             remedy = f" (another one: outputs: {{{kind}: NAME}})"
         return DataError(self.model.network, found, expected + remedy)
 
-    def _detected(self, outputs: Mapping[str, NDArray[Any]], place: Placement) -> ImageLabels:
+    def _detected(self, outputs: Mapping[str, NDArray[Any]], place: PictureLayout) -> ImageLabels:
         """Mask and instances of detections: of two that overlap the better one has the pixel."""
         scores, labels, masks = (self._part(outputs, name) for name in ("scores", "labels", "masks"))
         scores, labels = scores.reshape(-1), labels.reshape(-1)
@@ -181,7 +181,7 @@ class OnnxImageSegmenter:
         return ImageLabels(mask, instances)
 
     def _boxes(
-        self, outputs: Mapping[str, NDArray[Any]], masks: NDArray[Any], place: Placement
+        self, outputs: Mapping[str, NDArray[Any]], masks: NDArray[Any], place: PictureLayout
     ) -> NDArray[Any] | None:
         """(n, 4) corners in the input [px] where masks are those of the boxes; None: of the whole input."""
         if _fits(masks.shape[2], masks.shape[1], place) and masks.shape[2] * 8 >= place.whole[0]:
@@ -196,7 +196,7 @@ class OnnxImageSegmenter:
         return self._network.output(outputs, self.model.outputs.get(name, name))
 
 
-def _pasted(mask: NDArray[Any], box: NDArray[Any], place: Placement) -> NDArray[np.float32]:
+def _pasted(mask: NDArray[Any], box: NDArray[Any], place: PictureLayout) -> NDArray[np.float32]:
     """The mask (h', w') of a box in the input (h, w)."""
     width, height = place.whole
     left, top, right, bottom = (float(value) for value in box)
@@ -215,12 +215,12 @@ def _pasted(mask: NDArray[Any], box: NDArray[Any], place: Placement) -> NDArray[
     )
 
 
-def _fits(width: int, height: int, place: Placement) -> bool:
+def _fits(width: int, height: int, place: PictureLayout) -> bool:
     """Whether a map has the proportions of the input, of any stride up to 32 (a stride may round up)."""
     w, h = place.whole
     stride = max(1, round(w / max(width, 1)))
     return stride <= 32 and abs(width * stride - w) <= stride and abs(height * stride - h) <= stride
 
 
-def _proportions(place: Placement) -> str:
+def _proportions(place: PictureLayout) -> str:
     return f"{place.whole[1]} x {place.whole[0]}, or less by a stride up to 32"

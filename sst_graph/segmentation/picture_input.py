@@ -56,15 +56,15 @@ class PictureInput:
             scaled = np.array([[0.0], [255.0]]) / self.range
             return np.asarray((scaled - np.array(self.mean)) / np.array(self.std))
 
-    def place(self, width: int, height: int) -> Placement:
+    def place(self, width: int, height: int) -> PictureLayout:
         """Where a picture of a size [px] lies in the input."""
         w, h = self.width or width, self.height or height
         if self.resize == "stretch":
-            return Placement((width, height), (w, h), (0, 0, w, h))
+            return PictureLayout((width, height), (w, h), (0, 0, w, h))
         scale = min(w / width, h / height)
         inner_w, inner_h = max(1, round(width * scale)), max(1, round(height * scale))
         left, top = (w - inner_w) // 2, (h - inner_h) // 2
-        return Placement((width, height), (w, h), (left, top, inner_w, inner_h))
+        return PictureLayout((width, height), (w, h), (left, top, inner_w, inner_h))
 
     def values(self, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
         """The input (1, 3, h, w) or (1, h, w, 3) of a picture (h, w, 3) BGR."""
@@ -83,7 +83,7 @@ class PictureInput:
 
 
 @dataclass(frozen=True)
-class Placement:
+class PictureLayout:
     """Where a picture lies in an input: sizes (width, height), and its (left, top, width, height) there."""
 
     picture: tuple[int, int]
@@ -106,7 +106,7 @@ class Placement:
         return np.asarray(_resized(labels, self.picture, cv2.INTER_NEAREST_EXACT), np.uint8)
 
 
-def best_output(logits: NDArray[Any], place: Placement) -> NDArray[np.intp]:
+def best_output(logits: NDArray[Any], place: PictureLayout) -> NDArray[np.intp]:
     """Number (h, w) of the largest of the outputs (c, h', w') at each of the picture's pixels.
 
     One output at a time, for all at the picture's size take a gigabyte where there are 150.

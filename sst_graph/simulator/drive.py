@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.simulator.camera.render import Look, View, developed, shade
+from sst_graph.simulator.camera.render import CameraView, Look, developed, shade
 from sst_graph.simulator.camera.segmentation import noisy_mask, noisy_points
 from sst_graph.simulator.camera.textures import Atlas, detail_atlas, material_atlas, sky_panorama
 from sst_graph.simulator.casting import cast_image
 from sst_graph.simulator.config import SimulationConfig
 from sst_graph.simulator.lidar import Lidar, make_lidar
 from sst_graph.simulator.street import Street, build_street, is_instance
-from sst_graph.simulator.surfaces import SEMANTIC_CLASS, Kind
+from sst_graph.simulator.surfaces import SEMANTIC_CLASS, FaceKind
 from sst_graph.types import CameraImage, FloatArray, Frame, GroundTruth, Scan
 
 VIEW_RANGE_M = 140.0
@@ -211,13 +211,13 @@ class SimulatedDrive:
         rotation = np.asarray(pose.rotation().matrix())
         if cRv is not None:
             rotation = rotation @ cRv
-        view = View(camera, rotation, np.asarray(pose.translation()))
+        view = CameraView(camera, rotation, np.asarray(pose.translation()))
         triangles = snapshot.mesh.triangles
         seen = view.in_sight(triangles)
         faces, depth = cast_image(view.to_camera(triangles.take(seen, axis=0)), camera)
         faces = np.append(seen, -1)[faces]  # -1 stays -1
         light = shade(view, snapshot.mesh, faces, depth, self.look)
-        kinds = np.where(faces >= 0, snapshot.mesh.kinds[faces], np.uint8(Kind.SKY)).astype(np.uint8)
+        kinds = np.where(faces >= 0, snapshot.mesh.kinds[faces], np.uint8(FaceKind.SKY)).astype(np.uint8)
         numbers = np.where(is_instance(kinds), snapshot.instances[faces], 0).astype(np.uint16)
         return light, kinds, numbers
 

@@ -11,8 +11,8 @@ from sst_graph.simulator.casting import IndexArray, compact
 from sst_graph.simulator.config import SimulationConfig
 from sst_graph.simulator.mesh import normals_of, seen_from
 from sst_graph.simulator.motion import EgoMotion
-from sst_graph.simulator.street import Snapshot
-from sst_graph.simulator.surfaces import EXTRA_LOSS, Kind, Material
+from sst_graph.simulator.street import StreetSnapshot
+from sst_graph.simulator.surfaces import EXTRA_LOSS, FaceKind, Material
 from sst_graph.simulator.sweep import Columns, SweepMotion, cast_lidar
 from sst_graph.types import FloatArray
 
@@ -52,7 +52,9 @@ class Lidar:
     config: SimulationConfig
     slopes: FloatArray
 
-    def scan(self, snapshot: Snapshot, ego: EgoMotion, stamp_s: float, rng: np.random.Generator) -> Returns:
+    def scan(
+        self, snapshot: StreetSnapshot, ego: EgoMotion, stamp_s: float, rng: np.random.Generator
+    ) -> Returns:
         """One sweep at the stamp [s] through the faces of the snapshot (taken at that stamp)."""
         config = self.config
         rotation, position = (a[0] for a in ego.pose(np.array([stamp_s])))
@@ -75,7 +77,7 @@ class Lidar:
 
     def _returns(
         self,
-        snapshot: Snapshot,
+        snapshot: StreetSnapshot,
         triangles: FloatArray,
         hits: tuple[IndexArray, FloatArray],
         columns: Columns,
@@ -177,7 +179,7 @@ def _mixed(
 
 
 def _loss(
-    snapshot: Snapshot,
+    snapshot: StreetSnapshot,
     triangles: FloatArray,
     face: IndexArray,
     direction: FloatArray,
@@ -198,13 +200,15 @@ def _loss(
     return np.asarray(np.clip(loss, 0.0, 1.0))
 
 
-def _depth_noise(snapshot: Snapshot, face: IndexArray, sigma: float, rng: np.random.Generator) -> FloatArray:
+def _depth_noise(
+    snapshot: StreetSnapshot, face: IndexArray, sigma: float, rng: np.random.Generator
+) -> FloatArray:
     """(n,) range errors [m]: Gaussian; returns from inside crowns and from behind car windows come late."""
     noise = sigma * rng.standard_normal(len(face))
     if sigma == 0.0:
         return noise
     mesh = snapshot.mesh
-    leafy = mesh.kinds[face] == Kind.VEGETATION
+    leafy = mesh.kinds[face] == FaceKind.VEGETATION
     noise += np.where(leafy, rng.exponential(0.12, len(face)), 0.0)
     inside = (mesh.materials[face] == Material.GLASS) & (rng.uniform(size=len(face)) < 0.5)
     return np.asarray(noise + np.where(inside, rng.uniform(0.2, 1.0, len(face)), 0.0))

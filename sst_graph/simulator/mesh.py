@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.factors.motion import cross_rows
-from sst_graph.simulator.surfaces import Kind, Material
+from sst_graph.simulator.surfaces import FaceKind, Material
 from sst_graph.types import FloatArray
 
 Colour = tuple[float, float, float]
@@ -25,7 +25,7 @@ class Mesh:
 
     Attributes:
         triangles: (n, 3, 3) corners [m].
-        kinds: (n,) uint8 of :class:`Kind`.
+        kinds: (n,) uint8 of :class:`FaceKind`.
         materials: (n,) uint8 of :class:`Material`.
         colours: (n, 3) float32 BGR reflectance.
         textures: (n, 2, 4) texture coordinates [m]: ``textures[:, :, :3] @ p + textures[:, :, 3]``.
@@ -101,7 +101,7 @@ def planar_textures(triangles: FloatArray) -> FloatArray:
     return textures
 
 
-def soup(triangles: FloatArray, kind: Kind, material: Material | int, colour: Colour) -> Mesh:
+def soup(triangles: FloatArray, kind: FaceKind, material: Material | int, colour: Colour) -> Mesh:
     """A mesh of one kind, material and colour from triangles (n, 3, 3)."""
     n = len(triangles)
     return Mesh(

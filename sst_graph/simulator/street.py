@@ -19,7 +19,7 @@ from sst_graph.simulator.motion import (
     speed_profile,
     time_table,
 )
-from sst_graph.simulator.surfaces import Kind, Material
+from sst_graph.simulator.surfaces import FaceKind, Material
 from sst_graph.simulator.vehicles import random_car, random_truck
 from sst_graph.types import FloatArray
 
@@ -68,7 +68,7 @@ class MovingVehicle:
 
 
 @dataclass(frozen=True)
-class Snapshot:
+class StreetSnapshot:
     """All faces near the vehicle at one time.
 
     Attributes:
@@ -108,7 +108,7 @@ class Street:
     sun: FloatArray
     sunlight: float
 
-    def snapshot(self, t: float, range_m: float) -> Snapshot:
+    def snapshot(self, t: float, range_m: float) -> StreetSnapshot:
         """The faces within about ``range_m`` of the vehicle at time t [s]."""
         here = self.ego.pose(np.array([t]))[1][0, :2]
         near = np.linalg.norm(self.centres - here, axis=1) - self.radii < range_m
@@ -124,7 +124,7 @@ class Street:
             meshes.append(mesh)
             instances.append(np.full(len(mesh), vehicle.instance, np.uint16))
             velocities.append((later - earlier) / (2 * half))
-        return Snapshot(
+        return StreetSnapshot(
             extended(self.static, pick, meshes), np.concatenate(instances), np.concatenate(velocities)
         )
 
@@ -207,18 +207,18 @@ def _assembled(
     )
 
 
-def _profile(rng: np.random.Generator) -> tuple[scenery.Profile, tuple[bool, bool]]:
+def _profile(rng: np.random.Generator) -> tuple[scenery.StreetProfile, tuple[bool, bool]]:
     """A random cross-section, and on which sides (right, left) the cars park at an angle."""
     lane = rng.uniform(2.9, 3.6)
     angled = (bool(rng.uniform() < 0.15), bool(rng.uniform() < 0.3))
     kerbs = [lane + (5.0 if a else 2.15) for a in angled]
     walk = rng.uniform(1.6, 3.0)
     fronts = [kerb + walk + rng.choice([0.3, 1.5, 4.0, 7.0]) for kerb in kerbs]
-    return scenery.Profile(lane, (kerbs[0], kerbs[1]), walk, (fronts[0], fronts[1])), angled
+    return scenery.StreetProfile(lane, (kerbs[0], kerbs[1]), walk, (fronts[0], fronts[1])), angled
 
 
 def _lay_ground(
-    builder: _Builder, profile: scenery.Profile, rng: np.random.Generator, start: float, end: float
+    builder: _Builder, profile: scenery.StreetProfile, rng: np.random.Generator, start: float, end: float
 ) -> None:
     """Road, side-walks and verges, in pieces."""
     verge = Material.GRASS if rng.uniform() < 0.7 else Material.PAVING
@@ -231,7 +231,7 @@ def _lay_ground(
 
 
 def _raise_buildings(
-    builder: _Builder, profile: scenery.Profile, rng: np.random.Generator, start: float, end: float
+    builder: _Builder, profile: scenery.StreetProfile, rng: np.random.Generator, start: float, end: float
 ) -> None:
     """Houses, fences and hedges along the building line of both sides."""
     dense, tall = rng.uniform(0.3, 1.0), rng.uniform(5.0, 13.0)
@@ -256,7 +256,7 @@ def _raise_buildings(
 
 
 def _plant(
-    builder: _Builder, profile: scenery.Profile, rng: np.random.Generator, start: float, end: float
+    builder: _Builder, profile: scenery.StreetProfile, rng: np.random.Generator, start: float, end: float
 ) -> None:
     """Trees, lamps, signs and people on the side-walks."""
     gap, lamps = rng.uniform(7.0, 35.0), rng.uniform(22.0, 34.0)
@@ -297,7 +297,7 @@ def _with_shadow(mesh: Mesh, yaw: float, sun: FloatArray) -> Mesh:
 
 def _park(
     builder: _Builder,
-    profile: scenery.Profile,
+    profile: scenery.StreetProfile,
     angled: tuple[bool, bool],
     config: SimulationConfig,
     ends: tuple[float, float],
@@ -331,7 +331,7 @@ def _park(
 
 def _set_moving(
     builder: _Builder,
-    profile: scenery.Profile,
+    profile: scenery.StreetProfile,
     config: SimulationConfig,
     rng: np.random.Generator,
     way: tuple[FloatArray, FloatArray, float, float],
@@ -365,4 +365,4 @@ def _set_moving(
 
 def is_instance(kinds: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """(n,) whether faces of these kinds carry their object's instance (a shadow does not)."""
-    return np.isin(kinds, (Kind.CAR, Kind.TRUCK, Kind.PERSON))
+    return np.isin(kinds, (FaceKind.CAR, FaceKind.TRUCK, FaceKind.PERSON))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sst_graph.types import SemanticClass
 
 
-class Kind(IntEnum):
+class FaceKind(IntEnum):
     """What a face belongs to; the index into the label tables below."""
 
     ROAD = 0
@@ -28,27 +28,27 @@ class Kind(IntEnum):
     SKY = 12
 
 
-_TABLE: dict[Kind, tuple[int, int, SemanticClass]] = {
-    Kind.ROAD: (40, 7, SemanticClass.GROUND),
-    Kind.SIDEWALK: (48, 8, SemanticClass.GROUND),
-    Kind.TERRAIN: (72, 22, SemanticClass.TERRAIN),
-    Kind.BUILDING: (50, 11, SemanticClass.BUILDING),
-    Kind.FENCE: (51, 13, SemanticClass.FENCE),
-    Kind.VEGETATION: (70, 21, SemanticClass.VEGETATION),
-    Kind.TRUNK: (71, 21, SemanticClass.VEGETATION),
-    Kind.POLE: (80, 17, SemanticClass.POLE),
-    Kind.SIGN: (81, 20, SemanticClass.SIGN),
-    Kind.CAR: (10, 26, SemanticClass.VEHICLE),
-    Kind.TRUCK: (18, 27, SemanticClass.VEHICLE),
-    Kind.PERSON: (30, 24, SemanticClass.PERSON),
-    Kind.SKY: (0, 23, SemanticClass.SKY),
+_TABLE: dict[FaceKind, tuple[int, int, SemanticClass]] = {
+    FaceKind.ROAD: (40, 7, SemanticClass.GROUND),
+    FaceKind.SIDEWALK: (48, 8, SemanticClass.GROUND),
+    FaceKind.TERRAIN: (72, 22, SemanticClass.TERRAIN),
+    FaceKind.BUILDING: (50, 11, SemanticClass.BUILDING),
+    FaceKind.FENCE: (51, 13, SemanticClass.FENCE),
+    FaceKind.VEGETATION: (70, 21, SemanticClass.VEGETATION),
+    FaceKind.TRUNK: (71, 21, SemanticClass.VEGETATION),
+    FaceKind.POLE: (80, 17, SemanticClass.POLE),
+    FaceKind.SIGN: (81, 20, SemanticClass.SIGN),
+    FaceKind.CAR: (10, 26, SemanticClass.VEHICLE),
+    FaceKind.TRUCK: (18, 27, SemanticClass.VEHICLE),
+    FaceKind.PERSON: (30, 24, SemanticClass.PERSON),
+    FaceKind.SKY: (0, 23, SemanticClass.SKY),
 }
 
-SEMANTIC_KITTI = np.array([_TABLE[kind][0] for kind in Kind], dtype=np.uint32)
+SEMANTIC_KITTI = np.array([_TABLE[kind][0] for kind in FaceKind], dtype=np.uint32)
 """SemanticKITTI id of each kind."""
-CITYSCAPES = np.array([_TABLE[kind][1] for kind in Kind], dtype=np.uint8)
+CITYSCAPES = np.array([_TABLE[kind][1] for kind in FaceKind], dtype=np.uint8)
 """Cityscapes label id of each kind."""
-SEMANTIC_CLASS = np.array([_TABLE[kind][2] for kind in Kind], dtype=np.uint8)
+SEMANTIC_CLASS = np.array([_TABLE[kind][2] for kind in FaceKind], dtype=np.uint8)
 """:class:`SemanticClass` of each kind."""
 
 

@@ -16,7 +16,7 @@ from sst_graph.simulator.mesh import (
     merged,
     soup,
 )
-from sst_graph.simulator.surfaces import Kind, Material
+from sst_graph.simulator.surfaces import FaceKind, Material
 from sst_graph.types import FloatArray
 
 GLASS: Colour = (0.16, 0.14, 0.12)
@@ -111,20 +111,20 @@ def car_mesh(shape: CarShape, paint: Colour) -> Mesh:
         _body(shape, paint),
         _cabin(shape, paint),
         *_lamps(shape),
-        *_wheels(shape.axles, shape.wheel, shape.width, Kind.CAR),
+        *_wheels(shape.axles, shape.wheel, shape.width, FaceKind.CAR),
     ]
     half, rear, nose = shape.width / 2, -shape.length / 2, shape.length / 2
     inner = box_triangles((rear + 0.35, -half + 0.27, 0.19), (nose - 0.35, half - 0.27, 0.62))
-    parts.append(soup(inner, Kind.CAR, Material.PLAIN, BLACK))
+    parts.append(soup(inner, FaceKind.CAR, Material.PLAIN, BLACK))
     x_mirror = shape.x(shape.cowl) - 0.28
     for side in (-1, 1):
         y = sorted((side * (half - 0.05), side * (half + 0.13)))
         mirror = box_triangles((x_mirror, y[0], shape.belt), (x_mirror + 0.12, y[1], shape.belt + 0.14))
-        parts.append(soup(mirror, Kind.CAR, Material.PAINT, paint))
+        parts.append(soup(mirror, FaceKind.CAR, Material.PAINT, paint))
     for x in (rear - 0.015, nose - 0.005):
         z = 0.48 if x > 0 else 0.62
         plate = box_triangles((x, -0.26, z), (x + 0.02, 0.26, z + 0.11))
-        parts.append(soup(plate, Kind.CAR, Material.PLAIN, (0.8, 0.85, 0.85)))
+        parts.append(soup(plate, FaceKind.CAR, Material.PLAIN, (0.8, 0.85, 0.85)))
     return merged(parts)
 
 
@@ -173,7 +173,7 @@ def _body(shape: CarShape, paint: Colour) -> Mesh:
     ]
     y = [0.97 * w, w, w, 0.965 * w, 0.86 * w, 0.0 * w]
     half = np.stack([np.stack([x, yi, zi], axis=1) for yi, zi in zip(y, z, strict=True)], axis=1)
-    return soup(loft_triangles(_mirrored(half)), Kind.CAR, Material.PAINT, paint)
+    return soup(loft_triangles(_mirrored(half)), FaceKind.CAR, Material.PAINT, paint)
 
 
 def _lamps(shape: CarShape) -> list[Mesh]:
@@ -187,10 +187,10 @@ def _lamps(shape: CarShape) -> list[Mesh]:
         for side in (-1.0, 1.0):
             y = sorted((side * 0.5 * half, side * (0.775 if x > 0 else 0.79) * half))
             lamp = box_triangles((x, y[0], z), (x + 0.115, y[1], high))
-            parts.append(soup(lamp, Kind.CAR, Material.PLAIN, colour))
+            parts.append(soup(lamp, FaceKind.CAR, Material.PLAIN, colour))
     for low, high_x in ((nose - 0.05, nose + 0.012), (-nose - 0.012, -nose + 0.05)):
         bumper = box_triangles((low, -0.6 * half, 0.33), (high_x, 0.6 * half, 0.46))
-        parts.append(soup(bumper, Kind.CAR, Material.PLAIN, BLACK))
+        parts.append(soup(bumper, FaceKind.CAR, Material.PLAIN, BLACK))
     return parts
 
 
@@ -214,7 +214,7 @@ def _cabin(shape: CarShape, paint: Colour) -> Mesh:
     y = [base, base - 0.02, base - 0.26 * 0.8 * h - 0.02, top - 0.03, 0.8 * top - 0.03, 0.0 * top]
     z = [z0, z0 + 0.06, z0 + 0.06 + 0.8 * h, z0 + 0.06 + 0.95 * h, z0 + 0.06 + h, z0 + 0.09 + h]
     half = np.stack([np.stack([x, yi, zi], axis=1) for yi, zi in zip(y, z, strict=True)], axis=1)
-    mesh = soup(loft_triangles(_mirrored(half)), Kind.CAR, Material.PAINT, paint)
+    mesh = soup(loft_triangles(_mirrored(half)), FaceKind.CAR, Material.PAINT, paint)
     glass = _glazing(x, (x_foot, x_head, x_screen, x_cowl), pillar, half.shape[1])
     sides = np.zeros(len(mesh), np.bool_)
     sides[: 2 * glass.size] = np.concatenate([glass.ravel(), glass.ravel()])
@@ -239,7 +239,7 @@ def _glazing(
     return glass
 
 
-def _wheels(axles: tuple[float, ...], radius: float, width: float, kind: Kind) -> list[Mesh]:
+def _wheels(axles: tuple[float, ...], radius: float, width: float, kind: FaceKind) -> list[Mesh]:
     """Tyres with rims at both ends of each axle."""
     outer, inner = np.array([0.0, width / 2 - 0.02, radius]), np.array([0.0, width / 2 - 0.24, radius])
     rim = outer + np.array([0.0, 0.006, 0.0])
@@ -261,12 +261,12 @@ def random_truck(rng: np.random.Generator) -> Mesh:
     skirt = box_triangles((-nose + 2.6, -half + 0.1, 0.5), (nose - cab - 0.7, half - 0.1, 0.9))
     bumper = box_triangles((-nose + 0.05, -half + 0.15, 0.45), (-nose + 0.15, half - 0.15, 0.62))
     parts = [
-        soup(cargo, Kind.TRUCK, Material.PANEL, box_paint),
-        soup(frame, Kind.TRUCK, Material.PLAIN, BLACK),
-        soup(skirt, Kind.TRUCK, Material.PLAIN, (0.2, 0.2, 0.2)),
-        soup(bumper, Kind.TRUCK, Material.PLAIN, TAILLIGHT),
+        soup(cargo, FaceKind.TRUCK, Material.PANEL, box_paint),
+        soup(frame, FaceKind.TRUCK, Material.PLAIN, BLACK),
+        soup(skirt, FaceKind.TRUCK, Material.PLAIN, (0.2, 0.2, 0.2)),
+        soup(bumper, FaceKind.TRUCK, Material.PLAIN, TAILLIGHT),
         _cab(nose, half, cab, min(height, 2.6), paint),
-        *_wheels((-nose + 1.5, nose - 0.95), 0.45, width, Kind.TRUCK),
+        *_wheels((-nose + 1.5, nose - 0.95), 0.45, width, FaceKind.TRUCK),
     ]
     return merged(parts)
 
@@ -282,7 +282,7 @@ def _cab(nose: float, half: float, cab: float, height: float, paint: Colour) -> 
     z = [bottom, belt, np.maximum(top - 0.35, belt + 0.02), top - 0.08, top]
     y = [w, w, 0.98 * w, 0.94 * w, 0.0 * w]
     left = np.stack([np.stack([x, yi, zi], axis=1) for yi, zi in zip(y, z, strict=True)], axis=1)
-    mesh = soup(loft_triangles(_mirrored(left)), Kind.TRUCK, Material.PAINT, paint)
+    mesh = soup(loft_triangles(_mirrored(left)), FaceKind.TRUCK, Material.PAINT, paint)
     k = 2 * left.shape[1] - 1
     glass = np.zeros((len(x) - 1, k), np.bool_)
     glass[1, [1, k - 3]] = True

@@ -23,7 +23,7 @@ from sst_graph.factors.camera import PinholeCamera
 from sst_graph.simulator.camera.render import developed
 from sst_graph.simulator.camera.segmentation import noisy_mask
 from sst_graph.simulator.drive import SimulatedDrive
-from sst_graph.simulator.surfaces import SEMANTIC_CLASS, Kind
+from sst_graph.simulator.surfaces import SEMANTIC_CLASS, FaceKind
 from sst_graph.types import CameraImage, FloatArray, Frame, SemanticClass
 
 FINER = 2.0
@@ -79,7 +79,7 @@ class LensDrive(SourceView):
         """The picture of a frame; black and IGNORE where the lens sees nothing."""
         index, drive, model = self.frame_number(position), self.drive, self.model
         light = np.zeros((model.height, model.width, 3), np.float32)
-        kinds = np.full((model.height, model.width), np.uint8(Kind.SKY))
+        kinds = np.full((model.height, model.width), np.uint8(FaceKind.SKY))
         numbers = np.zeros((model.height, model.width), np.uint16)
         for part in self._parts:
             seen, part_kinds, part_numbers = drive.look_through(index, part.camera, part.cRv)

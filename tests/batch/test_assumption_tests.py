@@ -21,7 +21,7 @@ from sst_graph.covariance.considered import BUDGET, AssumptionConfig
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import ConfigError
-from sst_graph.experiments.assumptions import CLEAN, AssumptionTableConfig, Run, table
+from sst_graph.experiments.assumptions import CLEAN, AssumptionRun, AssumptionTableConfig, table
 from sst_graph.experiments.wrong_drives import with_focal, with_principal_point
 from sst_graph.graph.outer_loop import solve_joint
 from sst_graph.graph.state import State, nuisance_key
@@ -189,9 +189,9 @@ def test_the_linear_problem_agrees_with_a_solution_for_each_parameter(problem: S
 
 
 def test_the_table_counts_what_was_found() -> None:
-    def one(case: str, size: float, status: str, error: float, against: tuple[str, ...]) -> Run:
+    def one(case: str, size: float, status: str, error: float, against: tuple[str, ...]) -> AssumptionRun:
         errors, estimates = np.full(7, error), {"k1": (size, 0.01), "cx": (0.0, 5.0)}
-        return Run(1, case, size, status, errors, np.eye(7), estimates, against)
+        return AssumptionRun(1, case, size, status, errors, np.eye(7), estimates, against)
 
     text = table(
         [
@@ -208,9 +208,9 @@ def test_the_table_counts_what_was_found() -> None:
 
 
 def test_rows_count_sizes_in_deviations_with_in_sigmas() -> None:
-    def one(seed: int, case: str, size: float) -> Run:
+    def one(seed: int, case: str, size: float) -> AssumptionRun:
         estimates = {"k1": (size, 0.01 * seed)}
-        return Run(seed, case, size, "ok", np.zeros(7), np.eye(7), estimates, ())
+        return AssumptionRun(seed, case, size, "ok", np.zeros(7), np.eye(7), estimates, ())
 
     runs = [one(seed, CLEAN, 0.0) for seed in (1, 3)]
     runs += [one(seed, "k1", sign * 0.05 * seed) for seed in (1, 3) for sign in (1.0, -1.0)]

@@ -19,7 +19,7 @@ from sst_graph.batch.causes import with_causes
 from sst_graph.batch.method_estimate import guess_as_result
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.data.kept_drive import KeptDrive
-from sst_graph.diagnosis import Fit, labels, other_camera, preflight
+from sst_graph.diagnosis import LabelFit, labels, other_camera, preflight
 from sst_graph.diagnosis.cameras import image_size, uncalibrated
 from sst_graph.diagnosis.clocks import stamps, two_clocks
 from sst_graph.diagnosis.hypotheses import best_hypothesis
@@ -255,7 +255,7 @@ def test_a_shift_in_time_is_judged_by_scans_that_meet_an_image() -> None:
     (given,) = prepare_drives([slow], NO_SWEEP)
     tried: dict[float, int] = {}
 
-    def fit(changed: Drive, guess: Guess) -> Fit | None:
+    def fit(changed: Drive, guess: Guess) -> LabelFit | None:
         images = np.array(changed.image_stamps_ns) * 1e-9 + guess.time_offset_s
         apart = [np.abs(images - scan.stamp_ns * 1e-9).min() for scan in changed.scans]
         if guess.time_offset_s != 0.0:
@@ -352,12 +352,12 @@ def test_the_best_change_is_named_and_not_the_first_that_fits() -> None:
     """Of a street whose intrinsics have half the focal length: an inverted start fits well by chance."""
     right = prepared().camera
 
-    def fit(one: Drive, guess: Guess) -> Fit:
+    def fit(one: Drive, guess: Guess) -> LabelFit:
         if one.camera.fx > 1.5 * right.fx:
-            return Fit(CTL, guess.time_offset_s, 0.68, 0.86)
+            return LabelFit(CTL, guess.time_offset_s, 0.68, 0.86)
         if guess.cTl is not None and guess.cTl.equals(CTL.inverse(), 1e-9):
-            return Fit(CTL, guess.time_offset_s, 0.53, 0.78)
-        return Fit(CTL, guess.time_offset_s, 0.22, 0.47)
+            return LabelFit(CTL, guess.time_offset_s, 0.53, 0.78)
+        return LabelFit(CTL, guess.time_offset_s, 0.22, 0.47)
 
     found = best_hypothesis(prepared(), Guess(CTL), fit, fit(prepared(), Guess(CTL)))
     assert found is not None and NAMED["half the focal length"] in found.cause
@@ -551,13 +551,13 @@ def test_angles_in_the_wrong_unit(degrees: bool, words: str, sequence: str) -> N
     angles = Rotation.from_matrix(CTL.rotation().matrix()).as_euler(sequence, degrees=not degrees)
     misread = gtsam.Rot3(Rotation.from_euler(sequence, angles, degrees=degrees).as_matrix())
     true = CTL.retract(np.array([0.01, -0.015, 0.01, 0.0, 0.0, 0.0]))
-    found = wrong_start(gtsam.Pose3(misread, CTL.translation()), Fit(true, 0.0, 0.6, 0.8))
+    found = wrong_start(gtsam.Pose3(misread, CTL.translation()), LabelFit(true, 0.0, 0.6, 0.8))
     assert found is not None and words in found.cause
 
 
 def test_an_ambiguous_search_reports_no_wrong_start() -> None:
     behind = CTL * gtsam.Pose3(gtsam.Rot3.Rz(np.pi), np.zeros(3))
-    clear, unclear = Fit(behind, 0.0, 0.6, 0.8), Fit(behind, 0.0, 0.35, 0.6)
+    clear, unclear = LabelFit(behind, 0.0, 0.6, 0.8), LabelFit(behind, 0.0, 0.35, 0.6)
     found = wrong_start(CTL, clear)
     assert found is not None and "180 deg away" in found.evidence
     assert wrong_start(CTL, unclear) is None

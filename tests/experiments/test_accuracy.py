@@ -13,16 +13,16 @@ import pytest
 from sst_graph.batch import CalibrationConfig
 from sst_graph.errors import ConfigError
 from sst_graph.experiments import accuracy, drives
-from sst_graph.experiments.accuracy import SCENARIOS, AccuracyConfig, Outcome
+from sst_graph.experiments.accuracy import SCENARIOS, AccuracyConfig, AccuracyRun
 from sst_graph.experiments.drives import DrivesConfig
 from sst_graph.experiments.markdown import median
 from sst_graph.experiments.starts import start_near
 from sst_graph.metrics import CalibrationErrors, Nees
 
 
-def outcome(qad_deg: float, atd_m: float, time_s: float, status: str, failed: bool = False) -> Outcome:
+def outcome(qad_deg: float, atd_m: float, time_s: float, status: str, failed: bool = False) -> AccuracyRun:
     nees = Nees(8.0 * qad_deg, 2.0 * qad_deg, qad_deg, 0.5)
-    return Outcome(CalibrationErrors(qad_deg, 0.5 * qad_deg, atd_m, time_s, nees), status, failed)
+    return AccuracyRun(CalibrationErrors(qad_deg, 0.5 * qad_deg, atd_m, time_s, nees), status, failed)
 
 
 @pytest.mark.parametrize(

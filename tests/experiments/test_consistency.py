@@ -11,7 +11,7 @@ import pytest
 from sst_graph.batch import CalibrationConfig
 from sst_graph.errors import ConfigError
 from sst_graph.experiments import consistency
-from sst_graph.experiments.consistency import ConsistencyConfig, Run
+from sst_graph.experiments.consistency import ConsistencyConfig, ConsistencyRun
 
 
 @pytest.mark.parametrize(
@@ -32,14 +32,14 @@ def test_errors_drawn_from_the_covariance_are_consistent() -> None:
     A = rng.normal(size=(7, 7)) * 0.01
     covariance = A @ A.T + 1e-6 * np.eye(7)
     errors = rng.multivariate_normal(np.zeros(7), covariance, 4000)
-    cells = consistency.row("drawn", [Run(e, covariance, False) for e in errors], 90.0)
+    cells = consistency.row("drawn", [ConsistencyRun(e, covariance, False) for e in errors], 90.0)
     np.testing.assert_allclose([float(cell) for cell in cells[2:6]], 1.0, atol=0.05)
     shares = [float(cell.strip(" %")) for cell in cells[6].split(",")]
     np.testing.assert_allclose(shares, 95.0, atol=1.5)
 
 
 def test_what_did_not_converge_or_is_wrong_is_counted_and_left_out() -> None:
-    fine = Run(np.full(7, 0.01), np.eye(7) * 1e-4, False)
+    fine = ConsistencyRun(np.full(7, 0.01), np.eye(7) * 1e-4, False)
     lost = dataclasses.replace(fine, error=np.full(7, 1.0))
     not_converged = dataclasses.replace(lost, not_converged=True)
     cells = consistency.row("mixed", [fine, fine, lost, not_converged], 2.0)
@@ -48,9 +48,9 @@ def test_what_did_not_converge_or_is_wrong_is_counted_and_left_out() -> None:
 
 
 def test_the_offset_of_a_drive_at_standstill_is_left_out() -> None:
-    moving = Run(np.full(7, 0.01), np.eye(7) * 1e-4, False)
+    moving = ConsistencyRun(np.full(7, 0.01), np.eye(7) * 1e-4, False)
     error = np.append(np.full(6, 0.01), 0.0)
-    standing = Run(error, np.eye(7) * 1e-4, False, offset_observable=False)
+    standing = ConsistencyRun(error, np.eye(7) * 1e-4, False, offset_observable=False)
     cells = consistency.row("standing", [standing], 2.0)
     assert cells[4] == "–" and cells[6].count("%") == 2
     assert float(cells[5]) == pytest.approx(1.0)

@@ -10,14 +10,14 @@ import pytest
 
 from sst_graph.errors import ConfigError
 from sst_graph.experiments import motion
-from sst_graph.experiments.motion import MotionTableConfig, Outcome
+from sst_graph.experiments.motion import MotionRun, MotionTableConfig
 from sst_graph.experiments.registry import EXPERIMENTS
 from sst_graph.experiments.starts import start_near
 from sst_graph.metrics import CalibrationErrors, Nees
 
 
-def outcome(run: str, qad_deg: float, time_offset_s: float, status: str = "ok") -> Outcome:
-    return Outcome(
+def outcome(run: str, qad_deg: float, time_offset_s: float, status: str = "ok") -> MotionRun:
+    return MotionRun(
         run, CalibrationErrors(qad_deg, qad_deg, 0.02, time_offset_s, Nees(6.0, 3.0, 2.0, 1.0)), status, 1.5
     )
 
@@ -34,7 +34,7 @@ def test_a_row_by_hand() -> None:
 def test_every_drive_and_run_has_its_row() -> None:
     seen: list[tuple[str, int]] = []
 
-    def outcomes(config: MotionTableConfig, name: str, number: int) -> list[Outcome]:
+    def outcomes(config: MotionTableConfig, name: str, number: int) -> list[MotionRun]:
         seen.append((name, number))
         return [outcome(label, 0.1 * (number + 1), 0.001) for label in motion.RUNS]
 

@@ -8,13 +8,13 @@ import pytest
 
 from sst_graph.errors import ConfigError
 from sst_graph.experiments.registry import experiment
-from sst_graph.experiments.slam import MEASURES, SlamConfig, Street, markdown, solve_street
+from sst_graph.experiments.slam import MEASURES, SlamConfig, SlamRun, markdown, solve_street
 from sst_graph.simulator import SimulationConfig
 
 
-def street(weather: str, alone: float, both: float) -> Street:
+def street(weather: str, alone: float, both: float) -> SlamRun:
     poses, calibration = list(MEASURES)[:3], list(MEASURES)[3:]
-    return Street(
+    return SlamRun(
         weather,
         3,
         {

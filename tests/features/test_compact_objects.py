@@ -9,7 +9,7 @@ import pytest
 from streets import standing_street
 
 from sst_graph import open_source
-from sst_graph.features.compact_objects import Kind, find_compact_objects
+from sst_graph.features.compact_objects import ObjectShape, find_compact_objects
 from sst_graph.features.ground import heights_above_ground
 from sst_graph.types import SemanticClass
 
@@ -49,9 +49,9 @@ def test_a_box_and_a_pole_on_sloping_ground(slope: float) -> None:
     box = (np.abs(points[:, 0] - 10.0) < 1e-6) & (heights > 0.3)
     pole = (np.abs(points[:, 0] - 12.0) < 1e-6) & (heights > 0.3)
     assert len(set(found.numbers[box])) == len(set(found.numbers[pole])) == 1
-    assert (found.kinds[found.numbers][box] == Kind.VEHICLE_LIKE).all()
-    assert (found.kinds[found.numbers][pole] == Kind.POLE_LIKE).all()
-    assert (found.kinds[found.numbers][heights < 0.1] == Kind.GROUND).all()
+    assert (found.kinds[found.numbers][box] == ObjectShape.VEHICLE_LIKE).all()
+    assert (found.kinds[found.numbers][pole] == ObjectShape.POLE_LIKE).all()
+    assert (found.kinds[found.numbers][heights < 0.1] == ObjectShape.GROUND).all()
 
 
 def test_returns_from_below_the_road_do_not_lower_it() -> None:
@@ -72,7 +72,7 @@ def recall(points: np.ndarray, rings: np.ndarray | None, vehicles: np.ndarray) -
     found = find_compact_objects(points.astype(np.float64), rings)
     kinds = found.kinds[found.numbers]
     near = vehicles & (np.linalg.norm(points, axis=1) < 45.0)
-    compact = (kinds == Kind.VEHICLE_LIKE) | (kinds == Kind.POLE_LIKE)
+    compact = (kinds == ObjectShape.VEHICLE_LIKE) | (kinds == ObjectShape.POLE_LIKE)
     return int(np.count_nonzero(compact & near)), int(np.count_nonzero(near))
 
 

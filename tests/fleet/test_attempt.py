@@ -14,7 +14,7 @@ from sst_graph.errors import ConfigError
 from sst_graph.files import MANIFEST
 from sst_graph.fleet import BatchConfig, run_batch
 from sst_graph.fleet.attempt import MOST_KILLS, Job, run_drive
-from sst_graph.fleet.drives import Drive
+from sst_graph.fleet.drives import ListedDrive
 from sst_graph.fleet.places import Place
 from sst_graph.fleet.record import Record
 
@@ -59,7 +59,7 @@ def faults(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def attempted(name: str, tmp_path: Path, retries: int) -> Record:
     """The record of a drive that does not exist: an attempt that is let run ends as bad input."""
     job = Job(
-        Drive(name, Place(str(tmp_path / name))), (), Place(str(tmp_path / "out")), "/", retries=retries
+        ListedDrive(name, Place(str(tmp_path / name))), (), Place(str(tmp_path / "out")), "/", retries=retries
     )
     return run_drive(job)
 
@@ -156,8 +156,8 @@ def test_a_relative_path_means_the_same_data_from_every_folder(
         (".", "week1/drives/d1", refused),
     ):
         monkeypatch.chdir(tmp_path / folder)
-        done = run_batch([Drive("d1", Place(drive))], out, BatchConfig(), lambda progress: None, run)
+        done = run_batch([ListedDrive("d1", Place(drive))], out, BatchConfig(), lambda progress: None, run)
     assert done["d1"].place == str(tmp_path / "week1/drives/d1")
     monkeypatch.chdir(tmp_path / "week2")
     with pytest.raises(ConfigError, match=r"week2/drives/d1: found a result of .*week1/drives/d1"):
-        run_batch([Drive("d1", Place("drives/d1"))], out, BatchConfig(), lambda progress: None, refused)
+        run_batch([ListedDrive("d1", Place("drives/d1"))], out, BatchConfig(), lambda progress: None, refused)

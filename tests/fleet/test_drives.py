@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sst_graph.errors import ConfigError, DataError, SstGraphError
-from sst_graph.fleet.drives import Drive, file_name, find_drives, loose_files, with_vehicles
+from sst_graph.fleet.drives import ListedDrive, file_name, find_drives, loose_files, with_vehicles
 from sst_graph.fleet.places import Place
 
 
@@ -191,4 +191,4 @@ def test_names_fit_into_file_names() -> None:
     assert file_name("a/b c\n(é).mcap") == file_name("a/b c\n(e\u0301).mcap") == "a_b_c_é_.mcap"
     assert file_name("東京 7") == "東京_7" and len(file_name("東" * 999).encode()) == 150
     assert file_name("../../x") == "x" and file_name("..") == "_" and len(file_name("x" * 999)) == 150
-    assert Drive("x", Place.of("/a/b/")).place.url == "/a/b"
+    assert ListedDrive("x", Place.of("/a/b/")).place.url == "/a/b"

@@ -18,7 +18,7 @@ import pytest
 from sst_graph.errors import ConfigError
 from sst_graph.fleet.attempt import Job
 from sst_graph.fleet.dask_pool import run_on_dask
-from sst_graph.fleet.drives import Drive
+from sst_graph.fleet.drives import ListedDrive
 from sst_graph.fleet.local_pool import run_locally
 from sst_graph.fleet.places import Place
 from sst_graph.fleet.record import Record
@@ -26,7 +26,7 @@ from sst_graph.fleet.record import Record
 
 def jobs(count: int, folder: Path | str = "/") -> Iterator[Job]:
     for k in range(count):
-        yield Job(Drive(f"drive_{k:04d}", Place("/nowhere")), (), Place("/nowhere"), str(folder))
+        yield Job(ListedDrive(f"drive_{k:04d}", Place("/nowhere")), (), Place("/nowhere"), str(folder))
 
 
 def instant(job: Job) -> Record:

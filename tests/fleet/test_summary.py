@@ -19,7 +19,7 @@ from sst_graph import report
 from sst_graph.errors import DataError
 from sst_graph.export import fuse_marginals, marginal_of_result
 from sst_graph.factors import FactorError, PinholeCamera
-from sst_graph.fleet import BatchConfig, Drive, Place, Record, write_summary
+from sst_graph.fleet import BatchConfig, ListedDrive, Place, Record, write_summary
 from sst_graph.fleet.record import Cost, Numbers, Status
 from sst_graph.fleet.summary import page as summary_page
 from sst_graph.fleet.vehicles.fused import vehicle_of
@@ -85,12 +85,12 @@ def done(name: str, found: CalibrationResult) -> Record:
     )
 
 
-def drive(name: str, vehicle: str = "", date: str = "") -> Drive:
-    return Drive(name, Place(f"/data/{name}"), vehicle, date)
+def drive(name: str, vehicle: str = "", date: str = "") -> ListedDrive:
+    return ListedDrive(name, Place(f"/data/{name}"), vehicle, date)
 
 
 @pytest.fixture
-def batch() -> tuple[list[Drive], dict[str, Record]]:
+def batch() -> tuple[list[ListedDrive], dict[str, Record]]:
     """Six drives of a vehicle that is knocked before the fourth, and one of each kind of failure."""
     drives = [drive(f"a{k}", "car 1", f"2026-03-{k + 1:02d}T00:00:00+00:00") for k in range(6)]
     records = [done(f"a{k}", result(k, knock=0.03 * (k >= 3))) for k in range(6)]
@@ -103,7 +103,7 @@ def batch() -> tuple[list[Drive], dict[str, Record]]:
     return drives, {one.drive: one for one in records}
 
 
-def test_the_summary_says_it_all(batch: tuple[list[Drive], dict[str, Record]], tmp_path: Path) -> None:
+def test_the_summary_says_it_all(batch: tuple[list[ListedDrive], dict[str, Record]], tmp_path: Path) -> None:
     drives, records = batch
     outcome = write_summary(drives, records, Place.of(tmp_path), BatchConfig())
     assert not outcome.all_fine
@@ -125,7 +125,7 @@ def test_the_summary_says_it_all(batch: tuple[list[Drive], dict[str, Record]], t
 
 
 def test_parquet_has_the_rows_of_the_csv(
-    batch: tuple[list[Drive], dict[str, Record]], tmp_path: Path
+    batch: tuple[list[ListedDrive], dict[str, Record]], tmp_path: Path
 ) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     drives, records = batch
@@ -138,7 +138,7 @@ def test_parquet_has_the_rows_of_the_csv(
 
 
 def test_the_page_shows_failures_and_runs_nothing_of_the_data(
-    batch: tuple[list[Drive], dict[str, Record]], tmp_path: Path
+    batch: tuple[list[ListedDrive], dict[str, Record]], tmp_path: Path
 ) -> None:
     drives, records = batch
     write_summary(drives, records, Place.of(tmp_path), BatchConfig(options=("--no-report",)))
@@ -228,7 +228,7 @@ def test_drives_of_earlier_runs_that_are_not_given_are_told(tmp_path: Path) -> N
 
 
 def test_a_drift_is_not_drawn_across_a_change(
-    batch: tuple[list[Drive], dict[str, Record]], tmp_path: Path
+    batch: tuple[list[ListedDrive], dict[str, Record]], tmp_path: Path
 ) -> None:
     drives, records = batch
     write_summary(drives, records, Place.of(tmp_path), BatchConfig())

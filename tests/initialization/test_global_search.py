@@ -15,7 +15,7 @@ from sst_graph.initialization.global_search import (
     Candidate,
     SearchConfig,
     SearchProblem,
-    Stage,
+    SearchStage,
     _peaks,
     rotation_matrices,
     search_steps,
@@ -69,7 +69,7 @@ def scores_of(agreement: AgreementMap, states: States) -> np.ndarray:
     return run_to_end(agreement.score_steps(states))
 
 
-def search(config: SearchConfig, stages: tuple[Stage, ...]) -> tuple[gtsam.Pose3, list[Candidate]]:
+def search(config: SearchConfig, stages: tuple[SearchStage, ...]) -> tuple[gtsam.Pose3, list[Candidate]]:
     source, frames = drive()
     turn = np.radians(15.0) * np.array([2.0, -1.0, 2.0]) / 3.0
     guess = source.truth.cTl.retract(np.concatenate([turn, [0.05, -0.05, 0.05]]))
@@ -79,10 +79,10 @@ def search(config: SearchConfig, stages: tuple[Stage, ...]) -> tuple[gtsam.Pose3
 
 SMALL = SearchConfig()
 STAGES = (
-    Stage(45.0, 0.25, 12, samples=32, rounds=3),
-    Stage(22.0, 0.5, 6, samples=32, rounds=3),
-    Stage(10.0, 1.0, 4, samples=32, rounds=3),
-    Stage(4.0, 1.0, 3, samples=32, rounds=3),
+    SearchStage(45.0, 0.25, 12, samples=32, rounds=3),
+    SearchStage(22.0, 0.5, 6, samples=32, rounds=3),
+    SearchStage(10.0, 1.0, 4, samples=32, rounds=3),
+    SearchStage(4.0, 1.0, 3, samples=32, rounds=3),
 )
 
 
@@ -101,7 +101,10 @@ def test_from_15_degrees_to_below_4() -> None:
 
 
 def test_the_same_seed_gives_the_same_answer() -> None:
-    stages = (Stage(45.0, 0.25, 4, samples=16, rounds=2), Stage(22.0, 0.5, 2, samples=16, rounds=2))
+    stages = (
+        SearchStage(45.0, 0.25, 4, samples=16, rounds=2),
+        SearchStage(22.0, 0.5, 2, samples=16, rounds=2),
+    )
     first, second = (search(SMALL, stages)[1] for _ in range(2))
     assert [c.score for c in first] == [c.score for c in second]
     assert all(a.cTl.equals(b.cTl, 0.0) for a, b in zip(first, second, strict=True))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.inspect.report import Comparison, error_lines, markdown_report, summary
+from sst_graph.inspect.report import ReferenceErrors, error_lines, markdown_report, summary
 from sst_graph.metrics import FORWARD_R_OPTICAL, calibration_errors
 from sst_graph.result import CalibrationResult, DriveOffset, FrameId, WeakDirection
 from sst_graph.types import GroundTruth
@@ -58,7 +58,7 @@ def test_summary_names_each_drives_offset() -> None:
 
 def test_errors_against_the_truth() -> None:
     errors = calibration_errors(POSE, 0.1036, GroundTruth(POSE, 0.1), RESULT.covariance)
-    text = summary(RESULT, Comparison(errors, "the truth"))
+    text = summary(RESULT, ReferenceErrors(errors, "the truth"))
     assert "against the truth" in text and "+3.60 ms" in text
     assert "0.8 of 7" in text
 

@@ -11,7 +11,7 @@ import pytest
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.fit import FitQuality
 from sst_graph.inspect.reasons import MOST_LETTERS, as_sentence, capitalized, short_reason, short_reasons
-from sst_graph.inspect.report import Comparison, summary
+from sst_graph.inspect.report import ReferenceErrors, summary
 from sst_graph.inspect.verdict import fit_line, is_start, largest_sigmas, quality_line, verdict
 from sst_graph.metrics import CalibrationErrors
 from sst_graph.odometry.sweep import REMEDY
@@ -55,7 +55,7 @@ def test_a_start_that_stands_for_an_estimate_is_none() -> None:
     assert is_start(start)
     said = "No estimate: no frame shows the classes: label some. What stands in this result is the start."
     assert verdict(start) == said
-    comparison = Comparison(CalibrationErrors(0.0, 0.0, 0.0, 0.0, None), "the truth")
+    comparison = ReferenceErrors(CalibrationErrors(0.0, 0.0, 0.0, 0.0, None), "the truth")
     lines = summary(start, comparison).splitlines()
     assert "moved           not: no estimate could be made, and this is the start" in lines
     assert "start against the truth" in lines

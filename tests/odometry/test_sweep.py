@@ -27,8 +27,8 @@ from sst_graph.odometry.sweep import (
     with_sweep,
     with_sweep_of,
 )
-from sst_graph.odometry.sweep.estimate import CANDIDATES, Evidence, estimate
-from sst_graph.odometry.sweep.window import SECTORS, Window
+from sst_graph.odometry.sweep.estimate import CANDIDATES, SweepEvidence, estimate
+from sst_graph.odometry.sweep.window import SECTORS, SweepWindow
 from sst_graph.result import CalibrationResult, FrameId
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate, write_drive
 from sst_graph.sweep_timing import SweepTiming
@@ -260,19 +260,19 @@ def test_one_group_alone_excludes_no_hypothesis() -> None:
     loud[3] = -1e6
     flat = np.full((20, SECTORS), 1e-3)
     unit, curvature = np.ones(SECTORS), np.ones(SECTORS)
-    both = Evidence(unit, curvature, ((quiet, flat), (quiet, flat)))
+    both = SweepEvidence(unit, curvature, ((quiet, flat), (quiet, flat)))
     np.testing.assert_allclose(both.log_ratio(1.0), 20.0 - 20.0 * 0.5e-3)
     np.testing.assert_allclose(both.log_ratio(-1.0), -20.0 - 20.0 * 0.5e-3)
-    alone = Evidence(unit, curvature, ((quiet, flat), (loud, flat)))
+    alone = SweepEvidence(unit, curvature, ((quiet, flat), (loud, flat)))
     assert 2.9 < float(alone.log_ratio(1.0).max()) < 3.1
-    against = Evidence(unit, curvature, ((quiet, flat), (-quiet, flat)))
+    against = SweepEvidence(unit, curvature, ((quiet, flat), (-quiet, flat)))
     np.testing.assert_array_equal(against.log_ratio(1.0), 0.0)
 
 
 def test_groups_of_matches_add_up_to_the_registration() -> None:
     """By cell or by direction, with the poses following: the sums are the eliminated normal equations."""
     hall = _hall(6.0, -1.0, 180.0)
-    window = Window([hall(k) for k in range(6)], 0.1)
+    window = SweepWindow([hall(k) for k in range(6)], 0.1)
     found = estimate([window])
     present = found.linearized_at[0] * CANDIDATES[found.linearized_at[1]]
     sums = window.surface_sums(CANDIDATES.T, found.normals[0], present)

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.simulator.camera.render import View
+from sst_graph.simulator.camera.render import CameraView
 from sst_graph.simulator.casting import cast_image, clip_near, compact, plane_of
 from sst_graph.simulator.sweep import Columns, SweepMotion, cast_lidar
 from sst_graph.types import FloatArray
@@ -59,7 +59,7 @@ def test_all_that_is_in_the_picture_is_in_sight() -> None:
     rng = np.random.default_rng(6)
     triangles = soup(rng, rng.uniform(-15.0, 15.0, (2000, 3)), 1.3)
     for rotation in Rotation.random(8, random_state=rng).as_matrix():
-        view = View(CAMERA, rotation, rng.normal(size=3))
+        view = CameraView(CAMERA, rotation, rng.normal(size=3))
         faces, depth = cast_image(view.to_camera(triangles), CAMERA)
         seen = view.in_sight(triangles)
         assert set(faces[faces >= 0]) <= set(seen) and len(seen) < 0.5 * len(triangles)

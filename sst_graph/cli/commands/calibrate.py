@@ -22,7 +22,7 @@ from sst_graph.cli.rig import given_cameras, refuse_rig_options, run_rig
 from sst_graph.cli.video import videos_beside
 from sst_graph.files import atomic_directory
 from sst_graph.files.strict_json import strict_json
-from sst_graph.inspect.report import Comparison, verdict_and_summary
+from sst_graph.inspect.report import ReferenceErrors, verdict_and_summary
 from sst_graph.result import WALL_CLOCK, CalibrationResult
 from sst_graph.types import Source
 
@@ -79,7 +79,7 @@ def calibrate_drives(
     initial_time_offset_s: float,
     config: CalibrationConfig,
     camera: str,
-) -> tuple[CalibrationResult, Comparison | None]:
+) -> tuple[CalibrationResult, ReferenceErrors | None]:
     """The calibration of ``sources``, with progress on stderr, and its errors where they can be known."""
     with ProgressBar() as progress:
         result = calibrate(

@@ -22,7 +22,7 @@ from sst_graph.data.arrays import listed
 from sst_graph.data.folder.camera_file import read_camera, read_extrinsic
 from sst_graph.data.folder.stamps import StampedFiles, stamped_files
 from sst_graph.data.pictures import PictureFiles, mask_encoding, point_labels
-from sst_graph.data.point_files import SUFFIXES, Cloud, read_cloud
+from sst_graph.data.point_files import SUFFIXES, PointFields, read_cloud
 from sst_graph.data.rectified import RectifiedSource
 from sst_graph.data.scan_order import rings_from_order
 from sst_graph.data.source import Loader, SourceOptions
@@ -95,7 +95,7 @@ class CloudFiles:
         return with_intensities(scan, None if intensities is None else intensities[used])
 
     def _labels(
-        self, k: int, cloud: Cloud, used: NDArray[np.bool_]
+        self, k: int, cloud: PointFields, used: NDArray[np.bool_]
     ) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
         path = self.labels.get(k)
         if path is None and (labels := cloud.labels()) is not None:

@@ -18,7 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.data.arrays import MAX_POINTS, float_columns
-from sst_graph.data.point_files.cloud import MAX_POINT_BYTES, Cloud, check_count, cloud_of, structured_fields
+from sst_graph.data.point_files.cloud import (
+    MAX_POINT_BYTES,
+    PointFields,
+    check_count,
+    cloud_of,
+    structured_fields,
+)
 from sst_graph.errors import DataError, count_of, first_line
 
 _MAX_BYTES = 512 * 1024 * 1024
@@ -38,7 +44,7 @@ _BROKEN = (
 )
 
 
-def read_bin(data: bytes, path: Path) -> Cloud:
+def read_bin(data: bytes, path: Path) -> PointFields:
     """As :func:`~sst_graph.data.arrays.float_columns`; what is behind the intensity is left out, for nothing
     says what it is.
 
@@ -49,7 +55,7 @@ def read_bin(data: bytes, path: Path) -> Cloud:
     return cloud_of(path, {name: values[:, k] for k, name in enumerate(_COLUMNS[: values.shape[1]])})
 
 
-def read_npy(data: bytes, path: Path) -> Cloud:
+def read_npy(data: bytes, path: Path) -> PointFields:
     """One array.
 
     Raises:
@@ -58,7 +64,7 @@ def read_npy(data: bytes, path: Path) -> Cloud:
     return cloud_of(path, _fields(_array(data, path), path))
 
 
-def read_npz(data: bytes, path: Path) -> Cloud:
+def read_npz(data: bytes, path: Path) -> PointFields:
     """Arrays by name.
 
     Raises:

@@ -30,7 +30,7 @@ INTENSITIES = ("intensity", "reflectivity", "reflectance", "remission", "i")
 
 
 @dataclass(frozen=True, eq=False)
-class Cloud:
+class PointFields:
     """Fields of a cloud, each (n,): those that are used, others are left out.
 
     Attributes:
@@ -116,7 +116,7 @@ class Cloud:
         return values
 
 
-def cloud_of(path: Path, fields: Mapping[str, NDArray[Any]]) -> Cloud:
+def cloud_of(path: Path, fields: Mapping[str, NDArray[Any]]) -> PointFields:
     """A cloud of the fields that are used.
 
     Raises:
@@ -138,7 +138,7 @@ def cloud_of(path: Path, fields: Mapping[str, NDArray[Any]]) -> Cloud:
             found = f"{name} of {values.dtype}, shape {values.shape}"
             raise DataError(path, found, f"numbers, one a point ({count_of(count, 'point')})")
     check_count(path, count)
-    return Cloud(path, used)
+    return PointFields(path, used)
 
 
 def check_count(path: Path, count: int) -> None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sst_graph.data.point_files.cloud import (
     CLOUD_FILE,
     MAX_POINT_BYTES,
-    Cloud,
+    PointFields,
     check_count,
     cloud_of,
     structured_fields,
@@ -51,7 +51,7 @@ class PcdHeader:
     end: int
 
 
-def read_pcd(data: bytes, path: Path) -> Cloud:
+def read_pcd(data: bytes, path: Path) -> PointFields:
     """Points of a PCD file.
 
     Raises:

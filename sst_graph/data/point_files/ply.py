@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sst_graph.data.point_files.cloud import (
     MAX_POINT_BYTES,
-    Cloud,
+    PointFields,
     check_count,
     cloud_of,
     structured_fields,
@@ -42,7 +42,7 @@ class _Element:
     properties: list[tuple[str, str | None]] = field(default_factory=list)
 
 
-def read_ply(data: bytes, path: Path) -> Cloud:
+def read_ply(data: bytes, path: Path) -> PointFields:
     """Points of a PLY file.
 
     Raises:

@@ -6,13 +6,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from sst_graph.data.point_files.arrays import read_bin, read_npy, read_npz
-from sst_graph.data.point_files.cloud import CLOUD_FILE, Cloud
+from sst_graph.data.point_files.cloud import CLOUD_FILE, PointFields
 from sst_graph.data.point_files.pcd import read_pcd
 from sst_graph.data.point_files.ply import read_ply
 from sst_graph.errors import DataError
 from sst_graph.files.reading import read_file
 
-_READERS: Mapping[str, Callable[[bytes, Path], Cloud]] = {
+_READERS: Mapping[str, Callable[[bytes, Path], PointFields]] = {
     ".bin": read_bin,
     ".npy": read_npy,
     ".npz": read_npz,
@@ -22,7 +22,7 @@ _READERS: Mapping[str, Callable[[bytes, Path], Cloud]] = {
 SUFFIXES = tuple(_READERS)
 
 
-def read_cloud(path: Path) -> Cloud:
+def read_cloud(path: Path) -> PointFields:
     """The cloud in a .bin (x y z intensity in float32), .npy, .npz, .pcd or .ply file.
 
     Raises:

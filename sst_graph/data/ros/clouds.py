@@ -19,7 +19,7 @@ POINT_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f
 
 
 @dataclass(frozen=True)
-class Cloud:
+class MessagePoints:
     """Points of a message; those that are NaN, inf or at the origin are left out.
 
     Attributes:
@@ -39,7 +39,9 @@ class Cloud:
     intensities: NDArray[np.float32] | None = None
 
 
-def cloud_of(message: Any, stamp_ns: int, place: str, times: bool = True, labels: bool = False) -> Cloud:
+def cloud_of(
+    message: Any, stamp_ns: int, place: str, times: bool = True, labels: bool = False
+) -> MessagePoints:
     """The cloud of a message.
 
     Args:
@@ -64,7 +66,7 @@ def field_names(message: Any) -> tuple[str, ...]:
     return tuple(str(field.name) for field in message.fields)
 
 
-def _cloud(table: NDArray[Any], stamp_ns: int, place: str, times: bool, labels: bool) -> Cloud:
+def _cloud(table: NDArray[Any], stamp_ns: int, place: str, times: bool, labels: bool) -> MessagePoints:
     points = np.stack([np.asarray(table[axis], np.float64) for axis in "xyz"], axis=1).astype(np.float32)
     # Drivers give NaN or the origin for beams without a return.
     used = np.isfinite(points).all(axis=1) & (points != 0.0).any(axis=1)
@@ -72,7 +74,7 @@ def _cloud(table: NDArray[Any], stamp_ns: int, place: str, times: bool, labels: 
     if len(points) and float(np.abs(points).max()) > FARTHEST_M:
         found = f"a coordinate of {float(np.abs(points).max()):.3g} m"
         raise DataError(place, found, f"at most {FARTHEST_M:g} m")
-    return Cloud(
+    return MessagePoints(
         points,
         _rings(table),
         _offsets(table, stamp_ns, place) if times else None,

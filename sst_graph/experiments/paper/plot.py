@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sst_graph.experiments.paper.config import START, PaperTableConfig
-from sst_graph.experiments.paper.runs import Run
+from sst_graph.experiments.paper.runs import CaseRun
 from sst_graph.experiments.paper.summary import Layout
 from sst_graph.viz.matplotlib_figure import figure_class
 
@@ -27,7 +27,7 @@ def check_plot() -> None:
     figure_class(", or --set plot=false")
 
 
-def plot_svg(runs: Sequence[Run], layout: Layout, config: PaperTableConfig) -> str:
+def plot_svg(runs: Sequence[CaseRun], layout: Layout, config: PaperTableConfig) -> str:
     """The plot as SVG: rotation, translation and, where the table has it, the time offset.
 
     Raises:
@@ -36,7 +36,7 @@ def plot_svg(runs: Sequence[Run], layout: Layout, config: PaperTableConfig) -> s
     Figure = figure_class()
     import matplotlib as mpl
 
-    panels: list[tuple[str, Callable[[Run], float | None]]] = [
+    panels: list[tuple[str, Callable[[CaseRun], float | None]]] = [
         ("QAD [deg]", lambda run: run.qad_deg),
         ("ATD [cm]", lambda run: 100.0 * run.atd_m),
     ]
@@ -54,7 +54,7 @@ def plot_svg(runs: Sequence[Run], layout: Layout, config: PaperTableConfig) -> s
 
 
 def _panel(
-    axes: Any, runs: Sequence[Run], config: PaperTableConfig, value: Callable[[Run], float | None]
+    axes: Any, runs: Sequence[CaseRun], config: PaperTableConfig, value: Callable[[CaseRun], float | None]
 ) -> None:
     """A column of dots for each method and delay."""
     methods = (START, *config.methods)
@@ -80,6 +80,6 @@ def _panel(
     axes.yaxis.set_major_formatter("{x:g}")
 
 
-def _absolute_true_error_ms(run: Run) -> float | None:
+def _absolute_true_error_ms(run: CaseRun) -> float | None:
     error = run.true_error_ms
     return None if error is None else abs(error)

@@ -55,7 +55,7 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Run:
+class CaseRun:
     """What came of a case.
 
     Attributes:
@@ -106,7 +106,7 @@ def cases_of(drives: Sequence[TableDrive], config: PaperTableConfig) -> list[lis
     ]
 
 
-def runs_of(cases: Sequence[Case], config: PaperTableConfig) -> Iterator[list[Run]]:
+def runs_of(cases: Sequence[Case], config: PaperTableConfig) -> Iterator[list[CaseRun]]:
     """The run of each of the cases of one drive, which is read once, for the first method that needs it.
 
     Raises:
@@ -139,9 +139,9 @@ def start_of(case: Case, config: PaperTableConfig, cTl: gtsam.Pose3) -> gtsam.Po
     return start_near(cTl, config.start_deg, config.start_m, rng)
 
 
-def _run(case: Case, cTl: gtsam.Pose3, offset_s: float | None, truth: GroundTruth) -> Run:
+def _run(case: Case, cTl: gtsam.Pose3, offset_s: float | None, truth: GroundTruth) -> CaseRun:
     errors = calibration_errors(cTl, offset_s or 0.0, truth)
-    return Run(
+    return CaseRun(
         case.drive.name,
         case.images_late,
         case.start,

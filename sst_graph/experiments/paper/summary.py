@@ -15,7 +15,7 @@ from sst_graph.errors import count_of
 from sst_graph.experiments.basin import binomial_bounds
 from sst_graph.experiments.markdown import NONE, median, table
 from sst_graph.experiments.paper.config import START, VARIANTS, PaperTableConfig
-from sst_graph.experiments.paper.runs import Run
+from sst_graph.experiments.paper.runs import CaseRun
 
 OURS = "Numbering and layout are ours: they follow the questions of the paper, not its pages."
 
@@ -53,7 +53,7 @@ class Layout:
     with_time: bool
 
 
-def markdown(runs: Sequence[Run], layout: Layout, config: PaperTableConfig) -> str:
+def markdown(runs: Sequence[CaseRun], layout: Layout, config: PaperTableConfig) -> str:
     """The table: all streets together, or each drive on disk for itself."""
     lines = [f"**{layout.heading}.** {_conditions(layout, config)}", ""]
     columns = ["method", "failed", "of these flagged", "QAD of all, median [deg]", "QAD [deg]", "AEAD [deg]"]
@@ -73,10 +73,10 @@ def markdown(runs: Sequence[Run], layout: Layout, config: PaperTableConfig) -> s
     return "\n".join(lines)
 
 
-def csv_text(runs: Sequence[Run], config: PaperTableConfig) -> str:
+def csv_text(runs: Sequence[CaseRun], config: PaperTableConfig) -> str:
     """Every run in a row; times in seconds but for the two errors, in milliseconds."""
     text = io.StringIO()
-    names = [field.name for field in dataclasses.fields(Run)]
+    names = [field.name for field in dataclasses.fields(CaseRun)]
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([*names, "failed", "true_error_ms", "nominal_error_ms"])
     for run in runs:
@@ -110,7 +110,7 @@ def _conditions(layout: Layout, config: PaperTableConfig) -> str:
     )
 
 
-def _row(own: Sequence[Run], layout: Layout, config: PaperTableConfig) -> list[str]:
+def _row(own: Sequence[CaseRun], layout: Layout, config: PaperTableConfig) -> list[str]:
     """The runs of one method at one delay."""
     method, late = own[0].method, own[0].images_late
     bad = [run for run in own if run.failed(config)]

@@ -11,7 +11,7 @@ from sst_graph.drive.preparation import Progress
 from sst_graph.experiments.paper.config import PaperTableConfig
 from sst_graph.experiments.paper.drives import table_drives
 from sst_graph.experiments.paper.plot import check_plot, plot_svg
-from sst_graph.experiments.paper.runs import Case, Run, cases_of, runs_of
+from sst_graph.experiments.paper.runs import Case, CaseRun, cases_of, runs_of
 from sst_graph.experiments.paper.summary import Layout, Printed, csv_text, markdown
 from sst_graph.experiments.tasks.resumable import Work, rows_of
 
@@ -63,10 +63,10 @@ class PaperTable:
         plots = (out.with_suffix(".svg"),) if config.plot else ()
         return out, out.with_suffix(".csv"), *plots
 
-    def _runs(self, config: PaperTableConfig, progress: Progress | None, state: Path | None) -> list[Run]:
+    def _runs(self, config: PaperTableConfig, progress: Progress | None, state: Path | None) -> list[CaseRun]:
         """All runs of the table in its order."""
         run, key = partial(runs_of, config=config), partial(Case.key, config=config)
-        work = Work(run, Run, config.jobs, "" if state is None else str(state), key)
+        work = Work(run, CaseRun, config.jobs, "" if state is None else str(state), key)
         return rows_of(work, cases_of(table_drives(config), config), progress)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from sst_graph.fleet.drives import Drive
+from sst_graph.fleet.drives import ListedDrive
 from sst_graph.fleet.record import Record
 from sst_graph.fleet.vehicles.fused import Vehicle
 from sst_graph.inspect.inspection import HUMAN
@@ -31,7 +31,7 @@ _POSE = ("trans_x_m", "trans_y_m", "trans_z_m", "quat_x", "quat_y", "quat_z", "q
 
 
 def drive_rows(
-    drives: Sequence[Drive], records: Mapping[str, Record], vehicles: Sequence[Vehicle], report: str
+    drives: Sequence[ListedDrive], records: Mapping[str, Record], vehicles: Sequence[Vehicle], report: str
 ) -> list[Row]:
     """A row a drive, what needs attention first.
 

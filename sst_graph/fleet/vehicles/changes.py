@@ -28,7 +28,7 @@ from sst_graph.marginal import Separated, separated
 
 
 @dataclass(frozen=True, eq=False)
-class Finding:
+class VehicleChange:
     """A step, or a drive that contradicts the others.
 
     Attributes:
@@ -62,8 +62,8 @@ class Findings:
         left: the drives that are left.
     """
 
-    steps: dict[int, Finding]
-    contradicting: dict[str, Finding]
+    steps: dict[int, VehicleChange]
+    contradicting: dict[str, VehicleChange]
     left: tuple[DriveEstimate, ...]
 
 
@@ -86,7 +86,7 @@ def find_changes(drives: Sequence[DriveEstimate], config: WalkConfig) -> Finding
 def _next(state: Findings, config: WalkConfig, hypotheses: int) -> Findings | None:
     """With the least likely hypothesis that is left taken as true, or None where none is unlikely enough."""
     left, both_ways = state.left, passes(state.left, state.steps, config)
-    candidates: list[tuple[tuple[float, float], int, bool, Finding]] = []
+    candidates: list[tuple[tuple[float, float], int, bool, VehicleChange]] = []
     for k in range(len(left)):
         for a_step, finding in (
             (True, _step(both_ways, k, hypotheses)),
@@ -111,13 +111,13 @@ _ROUNDING = 1e-3
 """Relative difference of two chi-squared of the same hypothesis: what linearization leaves of it."""
 
 
-def _step(both_ways: Passes, k: int, hypotheses: int) -> Finding | None:
+def _step(both_ways: Passes, k: int, hypotheses: int) -> VehicleChange | None:
     """A step between drive k - 1 and drive k, if they are tied."""
     earlier = both_ways.before[k]
     return None if earlier is None else _compared(earlier, both_ways.since[k], hypotheses)
 
 
-def _alone(both_ways: Passes, left: Sequence[DriveEstimate], k: int, hypotheses: int) -> Finding | None:
+def _alone(both_ways: Passes, left: Sequence[DriveEstimate], k: int, hypotheses: int) -> VehicleChange | None:
     """Drive k against all others of its stretch, if there are any."""
     earlier, later = both_ways.before[k], both_ways.after[k]
     if earlier is None or later is None:
@@ -127,7 +127,7 @@ def _alone(both_ways: Passes, left: Sequence[DriveEstimate], k: int, hypotheses:
     return None if others is None else _compared(others, separated(left[k].marginal), hypotheses)
 
 
-def _compared(one: Separated, other: Separated, hypotheses: int) -> Finding:
+def _compared(one: Separated, other: Separated, hypotheses: int) -> VehicleChange:
     best = one.own.best()
     parts = []
     for separate in (one, other):
@@ -135,10 +135,10 @@ def _compared(one: Separated, other: Separated, hypotheses: int) -> Finding:
         covariance = there.own.covariance()
         parts.append(PartEstimate(covariance @ there.own.vector, covariance, common=there.errors))
     difference = Difference.of(parts[0], parts[1])
-    return Finding(difference, best.cTl, min(1.0, hypotheses * difference.p_value))
+    return VehicleChange(difference, best.cTl, min(1.0, hypotheses * difference.p_value))
 
 
-def _without(state: Findings, k: int, finding: Finding) -> Findings:
+def _without(state: Findings, k: int, finding: VehicleChange) -> Findings:
     """Drive k left out; a step before it stands before the next one."""
     steps = {at - (at > k): step for at, step in state.steps.items()}
     left = (*state.left[:k], *state.left[k + 1 :])

@@ -13,9 +13,9 @@ from sst_graph.errors import EstimationError
 from sst_graph.factors.arguments import checked_type
 from sst_graph.factors.errors import FactorError
 from sst_graph.files.strict_json import strict_json
-from sst_graph.fleet.drives import Drive, checked_drives
+from sst_graph.fleet.drives import ListedDrive, checked_drives
 from sst_graph.fleet.record import Numbers, Record
-from sst_graph.fleet.vehicles.changes import Finding, Findings, find_changes
+from sst_graph.fleet.vehicles.changes import Findings, VehicleChange, find_changes
 from sst_graph.fleet.vehicles.walk import DriveEstimate, Smoothed, WalkConfig, smoothed
 from sst_graph.imports.records import VEHICLE_FORMAT
 from sst_graph.result import WeakDirection
@@ -42,7 +42,7 @@ class Change:
     before: str
     since: str
     until: str
-    finding: Finding
+    finding: VehicleChange
     drives: tuple[int, int]
 
     @property
@@ -80,7 +80,7 @@ class Vehicle:
     calibration: Smoothed | None
     drift: tuple[Smoothed, ...]
     changes: tuple[Change, ...]
-    contradicting: Mapping[str, Finding]
+    contradicting: Mapping[str, VehicleChange]
     without: Mapping[str, str]
     dated: bool
     weak: tuple[WeakDirection, ...] = ()
@@ -98,7 +98,7 @@ class Vehicle:
 
 def vehicle_of(
     name: str,
-    drives: Sequence[Drive],
+    drives: Sequence[ListedDrive],
     records: Mapping[str, Record],
     config: WalkConfig,
     limits: ObservabilityConfig = _LIMITS,
@@ -154,7 +154,7 @@ def _without_result(name: str, without: Mapping[str, str]) -> Vehicle:
 
 
 def vehicles_of(
-    drives: Sequence[Drive],
+    drives: Sequence[ListedDrive],
     records: Mapping[str, Record],
     config: WalkConfig,
     limits: ObservabilityConfig = _LIMITS,
@@ -168,7 +168,7 @@ def vehicles_of(
     checked_type("records", records, Mapping, "a dict of records by the drive's name (run_batch)")
     config = expect_settings(config, WalkConfig)
     limits = expect_settings(limits, ObservabilityConfig)
-    by_vehicle: dict[str, list[Drive]] = {}
+    by_vehicle: dict[str, list[ListedDrive]] = {}
     for drive in drives:
         if drive.vehicle:
             by_vehicle.setdefault(drive.vehicle, []).append(drive)
@@ -225,7 +225,7 @@ def _plain(one: Smoothed) -> dict[str, Any]:
     }
 
 
-def _tested(finding: Finding) -> dict[str, Any]:
+def _tested(finding: VehicleChange) -> dict[str, Any]:
     return {
         "kinds": finding.kinds,
         "step": finding.difference.step,
@@ -235,7 +235,9 @@ def _tested(finding: Finding) -> dict[str, Any]:
     }
 
 
-def _counted(drives: Sequence[Drive], records: Mapping[str, Record]) -> tuple[list[Drive], dict[str, str]]:
+def _counted(
+    drives: Sequence[ListedDrive], records: Mapping[str, Record]
+) -> tuple[list[ListedDrive], dict[str, str]]:
     """Drives with a result that can be fused, and why the others cannot."""
     counted, without = [], {}
     owners: dict[str, str] = {}
@@ -266,7 +268,7 @@ def _numbers(records: Mapping[str, Record], name: str) -> Numbers:
     return numbers
 
 
-def _changes(found: Findings, drives: Mapping[str, Drive]) -> tuple[Change, ...]:
+def _changes(found: Findings, drives: Mapping[str, ListedDrive]) -> tuple[Change, ...]:
     names = [one.name for one in found.left]
     borders = [0, *sorted(found.steps), len(names)]
     sizes = {

@@ -12,7 +12,7 @@ import numpy as np
 from sst_graph.data.source import AT_THE_STAMP, TURNS
 from sst_graph.odometry.lidar import LidarOdometry
 from sst_graph.odometry.sweep.estimate import SweepEstimate, at_hypothesis, estimate, start_of
-from sst_graph.odometry.sweep.window import SECTORS, Window
+from sst_graph.odometry.sweep.window import SECTORS, SweepWindow
 from sst_graph.sampling import evenly_spread
 from sst_graph.sweep_timing import AT_ONCE, LONGEST_TURN_S, SweepStamp, SweepTiming
 from sst_graph.types import FloatArray, Scan
@@ -208,7 +208,7 @@ def decide_sweep(
         return SweepDecision("standstill", timing, speed_mps=max(pair.speed_mps for pair in pairs))
     both = _both_senses(timing)
     decision = SweepDecision("undecided", timing, others=both)
-    windows: list[Window] = []
+    windows: list[SweepWindow] = []
     used: list[int] = []
     for pair in sorted(pairs, key=lambda pair: pair.priority(period_s)):
         if pair.speed_ratio < 1.0 or any(abs(pair.position - k) < _WINDOW_SCANS // 2 for k in used):
@@ -252,7 +252,7 @@ def _pair_motions(scan_at: Callable[[int], Scan | None], count: int) -> list[_Pa
 
 def _window_around(
     pair: _PairMotion, scan_at: Callable[[int], Scan | None], count: int, period_s: float
-) -> tuple[list[int], Window | None]:
+) -> tuple[list[int], SweepWindow | None]:
     """The window around a pair and the positions of its scans; None where three scans cannot be had.
 
     Scans that are too far apart to be registered to one another are taken from closer together; in a drive
@@ -265,7 +265,7 @@ def _window_around(
         scans = {k: scan for k in positions if (scan := scan_at(k)) is not None}
         if len(scans) < 3:
             return [], None
-        window = Window([*scans.values()], period_s)
+        window = SweepWindow([*scans.values()], period_s)
         if window.ok and not _travels(window) and every < wanted:
             every = wanted
         elif not window.ok and every > 1:
@@ -274,7 +274,7 @@ def _window_around(
             return [*scans], window
 
 
-def _travels(window: Window) -> bool:
+def _travels(window: SweepWindow) -> bool:
     """Whether the vehicle moves enough from the first scan to the last."""
     return window.travel[0] >= _MIN_TRAVEL_M or window.travel[1] >= _MIN_TRAVEL_RAD
 
@@ -295,7 +295,7 @@ def _window_positions(pair: _PairMotion, count: int, every: int) -> list[int]:
     return list(range(first, min(count, first + length + 1), every))
 
 
-def _decide(windows: Sequence[Window], timing: SweepTiming) -> SweepDecision:
+def _decide(windows: Sequence[SweepWindow], timing: SweepTiming) -> SweepDecision:
     """The decision from some windows."""
     speed = max(float(np.linalg.norm(window.twists[:, 3:], axis=1).mean()) for window in windows)
     fraction, sector = 0.0, 0
@@ -310,7 +310,7 @@ def _decide(windows: Sequence[Window], timing: SweepTiming) -> SweepDecision:
 
 
 def _compare_hypotheses(
-    windows: Sequence[Window], found: SweepEstimate, timing: SweepTiming
+    windows: Sequence[SweepWindow], found: SweepEstimate, timing: SweepTiming
 ) -> SweepDecision:
     """The three hypotheses by their evidence, that of compensated points being 1."""
     evidence = found.evidence(windows)
@@ -386,7 +386,7 @@ def _start(costs: FloatArray) -> tuple[int, bool]:
     return widest[len(widest) // 2] % SECTORS, bool(alike.sum() <= SECTORS // 6)
 
 
-def _best_start(window: Window) -> tuple[float, int]:
+def _best_start(window: SweepWindow) -> tuple[float, int]:
     """The share of the sweep, and the sector at whose border a turn begins, under which scans meet best.
 
     Points between the right start and another are off by a whole turn and match nothing, so that the cost has

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sst_graph.odometry.sweep.window import ANNEALING, SECTORS, Normal, SurfaceSums, Window
+from sst_graph.odometry.sweep.window import ANNEALING, SECTORS, Normal, SurfaceSums, SweepWindow
 from sst_graph.types import FloatArray
 
 _MAX_FRACTION = 1.3
@@ -77,7 +77,7 @@ class SweepEstimate:
     linearized_at: tuple[float, int]
     misfit: float
 
-    def evidence(self, windows: Sequence[Window]) -> Evidence:
+    def evidence(self, windows: Sequence[SweepWindow]) -> SweepEvidence:
         """Evidence for every start of a turn, at the last matches."""
         present = self.linearized_at[0] * CANDIDATES[self.linearized_at[1]]
         groupings: tuple[list[SurfaceSums], list[SurfaceSums]] = ([], [])
@@ -92,7 +92,7 @@ class SweepEstimate:
         # A cluster-robust variance by each grouping (Cameron, Gelbach and Miller, 2011), the larger one.
         clustered = [sum((one.score**2).sum(axis=0) for one in sums) for sums in groupings]
         curvature = np.maximum(self.quadratic.curvature, 1e-12)
-        return Evidence(
+        return SweepEvidence(
             np.maximum.reduce([*clustered, modelled]) / curvature,
             curvature,
             tuple(
@@ -111,7 +111,7 @@ moving object, wrong matches), whatever its residuals."""
 
 
 @dataclass(frozen=True)
-class Evidence:
+class SweepEvidence:
     """Evidence of the registration on turns, by the sector at whose border they begin.
 
     Attributes:
@@ -143,7 +143,7 @@ class Evidence:
         return np.asarray(np.maximum(least, 0.0) + np.minimum(most, 0.0))
 
 
-def estimate(windows: Sequence[Window], fraction: float = 0.0, sector: int = 0) -> SweepEstimate:
+def estimate(windows: Sequence[SweepWindow], fraction: float = 0.0, sector: int = 0) -> SweepEstimate:
     """Share and start of least cost, iterated from those given, with the poses of the windows."""
     for number in range(_MAX_ITERATIONS):
         present = fraction, sector
@@ -160,7 +160,9 @@ def estimate(windows: Sequence[Window], fraction: float = 0.0, sector: int = 0) 
     return SweepEstimate(fraction, sector, quadratic, normals, present, _misfit(windows))
 
 
-def at_hypothesis(windows: Sequence[Window], fraction: float, sector: int, iterations: int) -> SweepEstimate:
+def at_hypothesis(
+    windows: Sequence[SweepWindow], fraction: float, sector: int, iterations: int
+) -> SweepEstimate:
     """The cost around a given share and start, with the poses that go with it."""
     for number in range(iterations):
         quadratic, normals = _matched(windows, fraction, sector, number)
@@ -171,7 +173,7 @@ def at_hypothesis(windows: Sequence[Window], fraction: float, sector: int, itera
 
 
 def _matched(
-    windows: Sequence[Window], fraction: float, sector: int, number: int
+    windows: Sequence[SweepWindow], fraction: float, sector: int, number: int
 ) -> tuple[Quadratic, tuple[Normal, ...]]:
     normals = tuple(window.linearized(fraction, start_of(sector), number) for window in windows)
     H = np.sum([normal.H for normal in normals], axis=0)
@@ -180,10 +182,10 @@ def _matched(
     return Quadratic(np.einsum("ij,ij->i", CANDIDATES @ H, CANDIDATES), CANDIDATES @ g), normals
 
 
-def _move(windows: Sequence[Window], normals: Sequence[Normal], step: FloatArray) -> None:
+def _move(windows: Sequence[SweepWindow], normals: Sequence[Normal], step: FloatArray) -> None:
     for window, normal in zip(windows, normals, strict=True):
         window.move(normal, step)
 
 
-def _misfit(windows: Sequence[Window]) -> float:
+def _misfit(windows: Sequence[SweepWindow]) -> float:
     return float(np.mean([window.misfit() for window in windows]))

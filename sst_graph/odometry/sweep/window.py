@@ -155,7 +155,7 @@ class Errors:
     shared: float
 
 
-class Window:
+class SweepWindow:
     """Scans of a part of the drive, and their poses."""
 
     def __init__(self, scans: Sequence[Scan], period_s: float) -> None:
@@ -167,7 +167,7 @@ class Window:
         self._surfaces = [_surfaces(points) for points in self._static_points(scans)]
         self._matches: list[_Matches] = []
 
-    def thinned(self, scans: int, points_per_direction: int) -> Window:
+    def thinned(self, scans: int, points_per_direction: int) -> SweepWindow:
         """The first scans of the window, matched to the next two only, with fewer points."""
         few = self.copy()
         few._intervals = (1, 2)
@@ -178,7 +178,7 @@ class Window:
         ]
         return few
 
-    def copy(self) -> Window:
+    def copy(self) -> SweepWindow:
         """The same scans; poses that move apart from this window's."""
         other = copy(self)
         other._poses, other._matches = list(self._poses), []

@@ -40,7 +40,7 @@ class Look:
 
 
 @dataclass(frozen=True)
-class View:
+class CameraView:
     """A camera at one instant.
 
     Attributes:
@@ -71,7 +71,7 @@ class View:
         return np.flatnonzero(seen)
 
 
-def shade(view: View, mesh: Mesh, faces: IndexArray, depth: FloatArray, look: Look) -> NDArray[Any]:
+def shade(view: CameraView, mesh: Mesh, faces: IndexArray, depth: FloatArray, look: Look) -> NDArray[Any]:
     """(h, w, 3) float BGR light of faces (h, w) of ``mesh`` at depth z (h, w) [m], no blur or noise."""
     seen, index = compact(faces)
     if seen[0] < 0:
@@ -100,7 +100,9 @@ def _lighting(part: Mesh, look: Look) -> FloatArray:
     return np.asarray(1.85 * light)[:, None]
 
 
-def _textured(view: View, part: Mesh, index: IndexArray, z: NDArray[np.float32], look: Look) -> NDArray[Any]:
+def _textured(
+    view: CameraView, part: Mesh, index: IndexArray, z: NDArray[np.float32], look: Look
+) -> NDArray[Any]:
     """(h, w, 3) float32 texture of faces ``index`` (h, w) of ``part`` at depth z."""
     camera = view.camera
     side = TILE_M[part.materials]
@@ -128,7 +130,7 @@ def _textured(view: View, part: Mesh, index: IndexArray, z: NDArray[np.float32],
     return base.astype(np.float32) * relief[:, :, None]
 
 
-def _sky(view: View, look: Look) -> NDArray[np.float32]:
+def _sky(view: CameraView, look: Look) -> NDArray[np.float32]:
     """(h, w, 3) float32 sky behind each pixel."""
     camera = view.camera
     # A quarter of the pixels, enlarged: the sky is smooth.

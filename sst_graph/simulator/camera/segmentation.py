@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.simulator.lidar import Returns
-from sst_graph.simulator.surfaces import Kind
+from sst_graph.simulator.surfaces import FaceKind
 from sst_graph.types import FloatArray
 
 JITTER_PX = 0.8
@@ -87,7 +87,7 @@ def _miss(kinds: Labels, instances: Numbers, level: float, seeds: tuple[int, int
         fate = np.random.default_rng([seeds[0], salt, int(number), seeds[1] // MISSED_FRAMES])
         if number and fate.uniform() < MISSED * level:
             where = instances == number
-            kinds[where] = Kind.BUILDING if fate.uniform() < 0.5 else Kind.VEGETATION
+            kinds[where] = FaceKind.BUILDING if fate.uniform() < 0.5 else FaceKind.VEGETATION
             instances[where] = 0
 
 
@@ -102,8 +102,8 @@ def _false_blob(kinds: Labels, instances: Numbers, rng: np.random.Generator) -> 
     )
     blob = np.zeros((h, w), np.uint8)
     cv2.fillPoly(blob, [np.rint(outline).astype(np.int32).reshape(-1, 1, 2)], (1,))
-    where = (blob > 0) & ~np.isin(kinds, (Kind.SKY, Kind.CAR, Kind.TRUCK))
-    kinds[where] = Kind.CAR
+    where = (blob > 0) & ~np.isin(kinds, (FaceKind.SKY, FaceKind.CAR, FaceKind.TRUCK))
+    kinds[where] = FaceKind.CAR
     instances[where] = 0
 
 
@@ -129,6 +129,6 @@ def noisy_points(
     new_kinds = np.where(swap, kinds[other], kinds)
     new_instances = np.where(swap, instances[other], instances)
     wrong = rng.uniform(size=len(kinds)) < WRONG_POINTS * level
-    new_kinds[wrong] = rng.choice(np.arange(int(Kind.SKY), dtype=np.uint8), int(wrong.sum()))
+    new_kinds[wrong] = rng.choice(np.arange(int(FaceKind.SKY), dtype=np.uint8), int(wrong.sum()))
     new_instances[wrong] = 0
     return new_kinds, new_instances

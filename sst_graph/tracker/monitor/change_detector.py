@@ -28,8 +28,8 @@ from sst_graph.tracker.monitor.statistic import (
     FRAMES,
     ChangeStatistic,
     ComparedEstimate,
-    Comparison,
     EstimateCovariance,
+    FrameScores,
 )
 from sst_graph.tracker.start.first_estimate import StartGuess
 from sst_graph.tracker.start.initializer import Restart
@@ -252,7 +252,7 @@ class ChangeDetector:
         """
         tried = steps(estimate.point.cTl, DETECTABLE_TURN_RAD, DETECTABLE_OFFSET_S)
 
-        def compared(*without: int) -> Comparison | None:
+        def compared(*without: int) -> FrameScores | None:
             scores = self._scores(pairs, estimate, {*without, *out})
             return self.statistic.compare(scores, estimate) if scores else None
 
@@ -410,7 +410,7 @@ class ChangeDetector:
                     shown |= self.statistic.detectable(more, tried)
             self.confirmation.add(shown)
 
-    def _with_earlier_frames(self, estimate: ComparedEstimate) -> Comparison:
+    def _with_earlier_frames(self, estimate: ComparedEstimate) -> FrameScores:
         """The latest scans that have been compared, as many as a change may be pending for, against the
         estimate from before the first of them."""
         first = self.matcher.window.next_scan - _MAX_PENDING_FRAMES

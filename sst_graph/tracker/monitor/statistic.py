@@ -82,7 +82,7 @@ class ComparedEstimate:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class FrameScores:
     """Scores of frames at an estimate that was made without them.
 
     Where nothing has changed, the gradient g of the frames' cost is zero-mean with variance M + H P H', so
@@ -122,7 +122,7 @@ class ComparedScores:
     """The scores of k pairs, made ready for comparisons of parts of them with one estimate.
 
     Attributes:
-        gradients, jacobians: (k, n), (k, n, m) of each pair, as of :class:`Comparison`.
+        gradients, jacobians: (k, n), (k, n, m) of each pair, as of :class:`FrameScores`.
         sums: of each pair's scores, in the n unknowns.
         prior: P (m, m).
         model: variances of residuals.
@@ -156,13 +156,13 @@ class ComparedScores:
         prior = covariance.with_objects(places, object_sigma_px)
         return cls(g, H, sums, prior, least, estimate.variance_ratio)
 
-    def part(self, start: int, end: int) -> Comparison:
+    def part(self, start: int, end: int) -> FrameScores:
         """The comparison of some of the pairs, one after the other."""
         n, sums = self.gradients.shape[1], self.sums[start:end]
         noise = total(n, sums, [np.arange(n)] * len(sums)).variance(self.model)
         noise = noise + _LEAST_INFORMATION * np.eye(n)
         gradient, jacobian = (each[start:end].sum(axis=0) for each in (self.gradients, self.jacobians))
-        return Comparison(gradient, jacobian, noise, self.prior, self.variance_ratio)
+        return FrameScores(gradient, jacobian, noise, self.prior, self.variance_ratio)
 
 
 class ChangeStatistic:
@@ -184,7 +184,7 @@ class ChangeStatistic:
         self.recent: deque[LinearizedPair] = deque(maxlen=FRAMES)
         self.usual: deque[float] = deque(maxlen=_USUAL_FRAMES)
         self.exceeded, self.newest = 0, 0.0
-        self.latest: Comparison | None = None
+        self.latest: FrameScores | None = None
 
     def restart(self) -> None:
         """Forget the frames, not their usual size: a new calibration begins."""
@@ -209,7 +209,7 @@ class ChangeStatistic:
             self.usual.append(T)
         return value
 
-    def compare(self, scores: Collection[LinearizedPair], estimate: ComparedEstimate) -> Comparison:
+    def compare(self, scores: Collection[LinearizedPair], estimate: ComparedEstimate) -> FrameScores:
         """Scores of any frames against an estimate."""
         return ComparedScores.of(scores, estimate, self.object_sigma_px).part(0, len(scores))
 
@@ -226,11 +226,11 @@ class ChangeStatistic:
         largest = max(values, key=values.__getitem__, default=(0, 0))
         return values.get(largest, 0.0), largest
 
-    def normalized(self, comparison: Comparison) -> float:
+    def normalized(self, comparison: FrameScores) -> float:
         """T over its usual size."""
         return comparison.chi2() / self._scale(comparison)
 
-    def detectable(self, comparison: Comparison, steps: FloatArray) -> NDArray[np.bool_]:
+    def detectable(self, comparison: FrameScores, steps: FloatArray) -> NDArray[np.bool_]:
         """(k,) which steps (7, k) of extrinsic and offset would be past the threshold.
 
         Matches that follow the pose show a step by so many times less than frozen ones.
@@ -248,13 +248,13 @@ class ChangeStatistic:
         """Past the threshold often enough in a row."""
         return self.exceeded >= CONFIRMATIONS
 
-    def _scale(self, comparison: Comparison) -> float:
+    def _scale(self, comparison: FrameScores) -> float:
         """How much larger than chi-squared T is; before that is known, the variance ratio bounds it."""
         if len(self.usual) < _LEAST_USUAL_FRAMES:
             return comparison.variance_ratio
         return self._usual_scale(comparison)
 
-    def _usual_scale(self, comparison: Comparison) -> float:
+    def _usual_scale(self, comparison: FrameScores) -> float:
         """How much larger than chi-squared's the usual 90th percentile is; 1 where that is not known."""
         if len(self.usual) < _LEAST_USUAL_FRAMES:
             return 1.0

@@ -20,7 +20,7 @@ from bags import CAMERA_FRAME, EPOCH_NS, LIDAR_FRAME, Messages, chain
 
 from sst_graph.cameras import BrownConradyCamera
 from sst_graph.data.ros.camera_info import image_geometry
-from sst_graph.data.ros.clouds import Cloud, cloud_of
+from sst_graph.data.ros.clouds import MessagePoints, cloud_of
 from sst_graph.data.ros.images import mask_of, picture_of
 from sst_graph.data.ros.topics import COMPRESSED, IMAGE
 from sst_graph.data.ros.transforms import Transforms
@@ -126,7 +126,7 @@ def table(count: int = 5, **columns: Any) -> np.ndarray[Any, Any]:
     return rows
 
 
-def read(rows: np.ndarray[Any, Any], big: bool = False, **options: bool) -> Cloud:
+def read(rows: np.ndarray[Any, Any], big: bool = False, **options: bool) -> MessagePoints:
     return cloud_of(MAKE.cloud(STAMP_NS, rows, big), STAMP_NS, "here", **options)
 
 

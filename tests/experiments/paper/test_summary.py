@@ -15,7 +15,7 @@ from sst_graph.errors import MissingDependencyError
 from sst_graph.experiments.paper.config import PaperTableConfig
 from sst_graph.experiments.paper.drives import TableDrive, table_drives
 from sst_graph.experiments.paper.plot import check_plot, plot_svg
-from sst_graph.experiments.paper.runs import Case, Run, start_of
+from sst_graph.experiments.paper.runs import Case, CaseRun, start_of
 from sst_graph.experiments.paper.summary import csv_text, markdown
 from sst_graph.experiments.paper.tables import TABLES
 
@@ -23,8 +23,10 @@ CONFIG = PaperTableConfig(streets=3, methods=("paper", "joint"))
 DRIVE = TableDrive("street 0", street=0)
 
 
-def run(method: str, qad_deg: float, atd_m: float, offset_s: float | None = None, status: str = "ok") -> Run:
-    return Run("street 0", 1, 0, method, qad_deg, 0.5 * qad_deg, atd_m, offset_s, 0.1036, status, True)
+def run(
+    method: str, qad_deg: float, atd_m: float, offset_s: float | None = None, status: str = "ok"
+) -> CaseRun:
+    return CaseRun("street 0", 1, 0, method, qad_deg, 0.5 * qad_deg, atd_m, offset_s, 0.1036, status, True)
 
 
 RUNS = [

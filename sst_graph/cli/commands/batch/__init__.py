@@ -20,9 +20,9 @@ from sst_graph.data.source import recognized
 from sst_graph.errors import ConfigError, count_of
 from sst_graph.fleet import (
     BatchConfig,
-    Drive,
+    BatchOutcome,
     Limits,
-    Outcome,
+    ListedDrive,
     Place,
     WalkConfig,
     find_drives,
@@ -117,7 +117,7 @@ def _check_passed_on(args: argparse.Namespace) -> None:
         load_initial(Path(args.init), args.camera or str(SOURCE_DEFAULTS["camera"]))
 
 
-def _but(out: Place, drives: list[Drive]) -> list[Drive]:
+def _but(out: Place, drives: list[ListedDrive]) -> list[ListedDrive]:
     """The drives without the batch's own folder, which may stand among them."""
     if not out.is_local:
         return drives
@@ -128,7 +128,7 @@ def _but(out: Place, drives: list[Drive]) -> list[Drive]:
     return left
 
 
-def _check_apart(drives: list[Drive], out: Place) -> None:
+def _check_apart(drives: list[ListedDrive], out: Place) -> None:
     """No drive stands in the batch's folder, nor the folder in a drive."""
     if not out.is_local:
         return
@@ -143,7 +143,7 @@ def _check_apart(drives: list[Drive], out: Place) -> None:
             )
 
 
-def _say_if_a_drive(what: str, drives: list[Drive]) -> None:
+def _say_if_a_drive(what: str, drives: list[ListedDrive]) -> None:
     """Tell who gives one drive in the place of a folder of drives."""
     place = Place.of(what)
     if not (place.is_local and place.is_folder()) or is_folder_of_bags(place.path):
@@ -166,7 +166,7 @@ def _say_loose(what: str) -> None:
         )
 
 
-def _say_without_vehicle(drives: list[Drive]) -> None:
+def _say_without_vehicle(drives: list[ListedDrive]) -> None:
     without = [drive.name for drive in drives if not drive.vehicle]
     if without:
         complain(f"note: no vehicle is known of {count_of(len(without), 'drive')}: {_some(without)}")
@@ -176,7 +176,7 @@ def _some(names: list[str]) -> str:
     return ", ".join(names[:_MOST_SAID]) + (", ..." if len(names) > _MOST_SAID else "")
 
 
-def _say(outcome: Outcome, out: Place) -> None:
+def _say(outcome: BatchOutcome, out: Place) -> None:
     mention(f"{'drives':<15} {len(outcome.rows)}: {counts_line(outcome.rows)}")
     wrong = [row for row in outcome.rows if not row["report"]]
     for row in wrong[:_MOST_SAID]:
