@@ -25,7 +25,7 @@ def as_sources(frames: Source | Sequence[Source]) -> list[Source]:
     sources: list[Any] = [frames]
     if not _is_source(frames):
         # What is endless is no sequence of drives, nor is an array without dimensions.
-        several = isinstance(frames, Iterable) and not isinstance(frames, np.ndarray | str | bytes)
+        several = isinstance(frames, Iterable) and not (isinstance(frames, np.ndarray) and frames.ndim == 0)
         sources = list(islice(frames, _MOST + 1)) if several else []
     if not sources or not all(_is_source(source) for source in sources):
         found = type(frames).__name__ if not sources else f"a sequence of {type(sources[0]).__name__}"

@@ -60,7 +60,7 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path, monkeypatch:
             (tmp_path / "folder", "a folder"),
             (tmp_path / "socket", "a socket"),
             (Path("/dev/zero"), "a character device"),
-            (tmp_path / ("x" * 300), "an unreadable file"),
+            (tmp_path / ("x" * 300), "a name of [0-9]+ characters"),
             (Path("a\0b"), "no name of a file"),
         ]:
             with pytest.raises(DataError, match=f"found {found}.*, expected a note"):
