@@ -134,7 +134,7 @@ def test_agreement_is_as_likely_as_said() -> None:
     knock = np.array([0.0, 0.0, np.radians(0.4), 0.0, 0.0, 0.0])  # three deviations of yaw
     knocked = replace(last, cTl=last.cTl.retract(knock))
     with pytest.raises(ContradictionError, match=r"'d' differs from the others in rotation by 0\.\d+°"):
-        fuse_marginals([*others, knocked], names="abcd")
+        fuse_marginals([*others, knocked], names=[*"abcd"])
     independent = [replace(one, common=Common()) for one in (*others, knocked)]
     fuse_marginals(independent)
 
