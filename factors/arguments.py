@@ -26,6 +26,20 @@ def checked_type(what: str, value: Any, kind: type | tuple[type, ...], expected:
         raise FactorError(what, described(value), expected)
 
 
+def checked_several(what: str, several: Any, kind: type, one: str, all_of_them: str) -> None:
+    """Nothing, where ``several`` is a list or tuple, and each in it of the kind.
+
+    Args:
+        one, all_of_them: what each should be, and what the whole.
+
+    Raises:
+        FactorError: it is not.
+    """
+    checked_type(what, several, (tuple, list), all_of_them)
+    for each in several:
+        checked_type(f"one of {what}", each, kind, one)
+
+
 def checked_callback(what: str, value: Any, parameters: tuple[str, ...]) -> None:
     """Nothing, where ``value`` is None, or can be called with these arguments.
 
@@ -66,16 +80,23 @@ def checked_gtsam(what: str, value: Any, kind: type) -> None:
     if not np.isfinite(matrix).all():
         raise FactorError(what, f"a {kind.__name__} that holds NaN or inf", "finite values")
     R = matrix[:3, :3]
-    # An entry of more than 2 is none of a rotation, and its products may overflow.
-    if np.abs(R).max() > 2.0 or (off := float(np.abs(R @ R.T - _EYE).max())) > _ROTATION_TOLERANCE:
-        found = f"an entry of {np.abs(R).max():.3g}" if np.abs(R).max() > 2.0 else f"|R R' - I| = {off:.2g}"
+    off = rotation_error(R)
+    if off > ROTATION_TOLERANCE:
+        found = f"|R R' - I| = {off:.2g}" if np.isfinite(off) else f"an entry of {np.abs(R).max():.3g}"
         raise FactorError(
             what, f"a {kind.__name__} with {found} in its rotation", "a rotation (gtsam.Rot3.ClosestTo)"
         )
 
 
-_EYE, _ROTATION_TOLERANCE = np.eye(3), 1e-3
-"""Largest entry of R R' - I that is put down to rounding in a file."""
+def rotation_error(R: FloatArray) -> float:
+    """Largest entry of |R R' - I| of a finite (3, 3) matrix; infinite where R has one above 2, which no
+    rotation has and whose products may overflow."""
+    return float(np.abs(R @ R.T - _EYE).max()) if np.abs(R).max() <= 2.0 else float("inf")
+
+
+ROTATION_TOLERANCE = 1e-3
+"""Largest :func:`rotation_error` that is put down to the digits of a file."""
+_EYE = np.eye(3)
 
 
 def checked_array(what: str, value: ArrayLike, shape: tuple[int | None, ...]) -> FloatArray:

@@ -18,7 +18,14 @@ import gtsam
 import numpy as np
 
 from sst_graph.errors import DataError
-from sst_graph.factors.arguments import as_numbers, checked_gtsam, checked_number, checked_type, described
+from sst_graph.factors.arguments import (
+    as_numbers,
+    checked_gtsam,
+    checked_number,
+    checked_several,
+    checked_type,
+    described,
+)
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.files.checked_values import (
     check_covariance,
@@ -170,10 +177,8 @@ class CalibrationResult:
         for name in ("fit", "edges_fit"):
             checked_type(name, getattr(self, name), (Fit, type(None)), "a Fit, or None")
         for name, kind in _SEVERAL.items():
-            several = getattr(self, name)
-            checked_type(name, several, (tuple, list), f"a tuple of {kind.__name__}")
-            for one in several:
-                checked_type(f"one of {name}", one, kind, f"a {kind.__name__}")
+            one, several = f"a {kind.__name__}", f"a tuple of {kind.__name__}"
+            checked_several(name, getattr(self, name), kind, one, several)
         for name in ("config", "read_as", "diagnostics", "versions"):
             checked_type(name, getattr(self, name), Mapping, "a dict")
         check_finite("time_offset_s", as_numbers("time_offset_s", self.time_offset_s), ())

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import gtsam
 import numpy as np
+import pytest
 from gtsam.symbol_shorthand import E, V
+
+from sst_graph.errors import SstGraphError
 
 POSE = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.2, 0.3), np.array([0.1, 0.2, 0.3]))
 UNIT = gtsam.noiseModel.Unit.Create(6)
@@ -56,3 +60,32 @@ WRONG: dict[str, Any] = {
     "object": object(),
 }
 """By a word for each."""
+
+
+def check_refusals(
+    name: str,
+    call: Callable[..., Any],
+    arguments: dict[str, Any],
+    fits_by_name: Mapping[str, set[str]],
+    in_one_sentence: Callable[[str], None],
+) -> None:
+    """Call with arguments that fit, then with each of them replaced by each of the wrong objects.
+
+    Args:
+        fits_by_name: which of these fit, by name of the argument, or of function and argument.
+        in_one_sentence: what an error must say.
+    """
+    call(**arguments)
+    for argument in arguments:
+        fits = fits_by_name.get(f"{name}.{argument}", fits_by_name.get(argument, set()))
+        for kind, wrong in WRONG.items():
+            try:
+                call(**{**arguments, argument: wrong})
+            except SstGraphError as error:
+                said = str(error)
+                assert kind not in fits, f"{name}({argument}={kind}): {said}"
+                in_one_sentence(said)
+            except Exception as error:
+                pytest.fail(f"{name}({argument}={kind}): {type(error).__name__}: {error}")
+            else:
+                assert kind in fits, f"{name}({argument}={kind}) was taken"

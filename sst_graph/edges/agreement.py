@@ -111,11 +111,8 @@ class BlurredScore:
         paired = edges.paired(state)
         if paired is None:
             return None
-        known = [
-            k
-            for k, (each, count) in enumerate(zip(paired.contours, paired.counts.tolist(), strict=True))
-            if count and isinstance(each, PictureGradients)
-        ]
+        seen = np.flatnonzero(paired.counts).tolist()
+        known = [k for k in seen if isinstance(paired.contours[k], PictureGradients)]
         group = paired.repeated(np.arange(len(paired.contours)))
         paired_index = np.flatnonzero(np.isin(group, known))
         paired, group = paired.take(paired_index), group[paired_index]

@@ -17,7 +17,7 @@ import numpy as np
 
 from sst_graph.errors import EstimationError, count_of, first_line
 from sst_graph.export.agreement import SIGNIFICANCE, check_agreement, check_apart
-from sst_graph.factors.arguments import checked_type, described
+from sst_graph.factors.arguments import checked_several, checked_type, described
 from sst_graph.factors.errors import FactorError
 from sst_graph.inspect.considered import considered_errors
 from sst_graph.marginal import (
@@ -304,12 +304,9 @@ def fuse_marginals(
         FactorError: no marginals, no names, or no probability.
     """
     _check_probability(significance)
-    checked_type("names", names, (list, tuple), "a list of texts")
-    for name in names:
-        checked_type("one of names", name, str, "a text")
-    checked_type("marginals", marginals, (list, tuple), "a list of CalibrationMarginal")
-    for each in marginals:
-        checked_type("marginals", each, CalibrationMarginal, "a list of CalibrationMarginal")
+    checked_several("names", names, str, "a text", "a list of texts")
+    several = "a list of CalibrationMarginal"
+    checked_several("marginals", marginals, CalibrationMarginal, "a CalibrationMarginal", several)
     if not marginals:
         raise EstimationError("no marginal to fuse")
     if names and len(names) != len(marginals):

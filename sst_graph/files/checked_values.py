@@ -14,12 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sst_graph.errors import DataError
-from sst_graph.factors.arguments import described
+from sst_graph.factors.arguments import ROTATION_TOLERANCE, described, rotation_error
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.types import FloatArray
 
-ROTATION_TOLERANCE = 1e-3
-"""Largest entry of R R' - I that is put down to rounding in a file."""
 MAX_TRANSLATION_M = 1000.0
 """Between two sensors on one vehicle, ships and cranes included."""
 MAX_OFFSET_S = 1e9
@@ -58,9 +56,9 @@ def checked_pose(matrix: FloatArray, place: str) -> gtsam.Pose3:
     R = matrix[:3, :3]
     if np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-9:
         raise DataError(place, f"last row {matrix[3].tolist()}", "0 0 0 1")
-    if np.abs(R).max() > 2.0:  # else the products overflow
+    off = rotation_error(R)
+    if not np.isfinite(off):
         raise DataError(place, f"a 3x3 block with an entry of {np.abs(R).max():.3g}", "a rotation matrix")
-    off = float(np.abs(R @ R.T - np.eye(3)).max())
     determinant = float(np.dot(np.cross(R[0], R[1]), R[2]))
     if off > ROTATION_TOLERANCE or determinant < 0.0:
         found = f"a 3x3 block with |R R' - I| = {off:.2g}, det {determinant:.3g}"

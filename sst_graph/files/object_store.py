@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sst_graph.errors import count_of
+from sst_graph.factors.arguments import rotation_error
 from sst_graph.files.typed_values import wrong_fields
 
 Node = Any
@@ -590,5 +591,4 @@ def _state(value: object) -> Mapping[str, Any]:
 
 def _is_rotation(R: NDArray[np.float64]) -> bool:
     """Whether a finite (3, 3) matrix is one."""
-    R = np.clip(R, -2.0, 2.0)  # so that the product does not overflow
-    return bool(np.abs(R @ R.T - np.eye(3)).max() <= _ROTATION_TOLERANCE and np.linalg.det(R) >= 0.0)
+    return bool(rotation_error(R) <= _ROTATION_TOLERANCE and np.linalg.det(R) >= 0.0)

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from sst_graph.errors import ConfigError, DataError, count_of
-from sst_graph.factors.arguments import checked_count, checked_type
+from sst_graph.factors.arguments import checked_count, checked_several, checked_type
 from sst_graph.fleet.places import Place
 
 _NOT_IN_A_NAME = re.compile(r"[^\w.=+-]+")
@@ -60,8 +60,8 @@ class ListedDrive:
 
     def __post_init__(self) -> None:
         for field in ("name", "vehicle", "date"):
-            checked_type(f"{field} of a Drive", getattr(self, field), str, "a text")
-        checked_type("place of a Drive", self.place, Place, "a Place (Place.of)")
+            checked_type(f"{field} of a ListedDrive", getattr(self, field), str, "a text")
+        checked_type("place of a ListedDrive", self.place, Place, "a Place (Place.of)")
         _checked_date(self.date, f"date of the drive {self.name:.60}")
 
     @property
@@ -76,10 +76,8 @@ def checked_drives(drives: Sequence[ListedDrive]) -> None:
     Raises:
         FactorError: it is none.
     """
-    expected = "a list of Drive (find_drives)"
-    checked_type("drives", drives, (list, tuple), expected)
-    for drive in drives:
-        checked_type("one of the drives", drive, ListedDrive, "a Drive (find_drives)")
+    one, several = "a ListedDrive (find_drives)", "a list of ListedDrive (find_drives)"
+    checked_several("drives", drives, ListedDrive, one, several)
 
 
 def find_drives(what: str | Path, name_parts: int = 1) -> list[ListedDrive]:

@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 
 from sst_graph.errors import ConfigError
-from sst_graph.factors.arguments import checked_gtsam, checked_number, checked_type
+from sst_graph.factors.arguments import checked_gtsam, checked_number, checked_several, checked_type
 from sst_graph.types import ByValue, FloatArray
 
 ROTATION_SIGMA_DEG, TRANSLATION_SIGMA_M = 0.03, 0.002
@@ -86,9 +86,8 @@ class KnownRig:
             ConfigError: naming the camera.
             FactorError: no names.
         """
-        checked_type("cameras of KnownRig.check", cameras, (list, tuple), "the names of the cameras")
-        for name in cameras:
-            checked_type("cameras of KnownRig.check", name, str, "the name of a camera")
+        what, expected = "cameras of KnownRig.check", "the names of the cameras"
+        checked_several(what, cameras, str, "the name of a camera", expected)
         for pose in self.poses:
             for name in (pose.camera, pose.reference):
                 if name not in cameras:

@@ -16,7 +16,7 @@ from typing import Any, cast
 import numpy as np
 
 from sst_graph.errors import ConfigError, DataError, count_of
-from sst_graph.factors.arguments import checked_type, described
+from sst_graph.factors.arguments import checked_several, checked_type, described
 from sst_graph.files.checked_values import check_covariance, check_finite, read_only
 from sst_graph.files.json_table import JsonTable, json_table
 from sst_graph.files.reading import FileKind, parse_json, path_of, read_text
@@ -64,9 +64,7 @@ class RigResult:
             checked_type("name of a camera", name, str, "a text")
             checked_type(f"calibration of {name:.60}", camera, CalibrationResult, "a CalibrationResult")
         checked_type("known", self.known, KnownRig, "a KnownRig")
-        checked_type("reasons", self.reasons, (tuple, list), "a tuple of texts")
-        for reason in self.reasons:
-            checked_type("one of reasons", reason, str, "a text")
+        checked_several("reasons", self.reasons, str, "a text", "a tuple of texts")
         checked_type("diagnostics", self.diagnostics, Mapping, "a dict")
         n = 7 * len(self.cameras)
         check_status(self.status)
