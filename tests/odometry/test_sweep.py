@@ -34,6 +34,7 @@ from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate, writ
 from sst_graph.sweep_timing import SweepTiming
 from sst_graph.types import Frame, Guess, Scan
 from studies.edges_streets import source_of
+from studies.sweep import street
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 PARKED = DATA / "kitti_2011_09_26_parked"
@@ -286,6 +287,30 @@ def test_groups_of_matches_add_up_to_the_registration() -> None:
     assert 0.008 < np.sqrt(window.errors.own) < 0.03 and np.sqrt(window.errors.shared) < 0.01
 
 
+def test_a_match_lies_along_the_mean_of_both_normals() -> None:
+    """Normals of one scan that are off by an angle turn those of its matches by half of it."""
+    hall, angle = _hall(0.0, 0.0, 180.0), 0.1
+    window = Window([hall(k) for k in range(3)], 0.1)
+
+    def normals() -> np.ndarray[Any, Any]:
+        window.linearized(0.0, 0.0, 9)
+        rows = window._matches[0]
+        np.testing.assert_allclose(np.linalg.norm(rows.of_poses[:, 9:], axis=1), 1.0)
+        return rows.of_poses[:, 9:]
+
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    before = normals()
+    other = window._surfaces[1]
+    turned_normals = other.normals.copy()
+    turned_normals[:, :2] = turned_normals[:, :2] @ turn.T
+    window._surfaces[1] = replace(other, normals=turned_normals)
+    after = normals()
+    upright = np.abs(before[:, 2]) < 0.1
+    assert upright.sum() > 100 and len(before) == len(after)
+    first, second = (np.arctan2(n[upright, 1], n[upright, 0]) for n in (before, after))
+    np.testing.assert_allclose(np.mod(second - first + np.pi, 2 * np.pi) - np.pi, 0.5 * angle, atol=1e-3)
+
+
 @pytest.mark.slow
 def test_nothing_is_decided_without_evidence() -> None:
     still = decide_sweep(_hall(0.0, -1.0, 180.0), 14)
@@ -314,6 +339,20 @@ def test_the_sweep_of_a_street(output: Any, sense: Any, kind: str) -> None:
     drive = simulate(replace(STREET, sweep_output=output, sweep_sense=sense))
     found = decide_sweep(drive.scan, len(drive))
     assert found.kind == kind, found.sentence
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "output"), [(565, "raw"), (727, "compensated")])
+def test_a_start_in_view_is_not_taken_for_another_one(seed: int, output: str) -> None:
+    """Evidence that is bounded by group forgives a start beside the right one; and what odometry left of the
+    poses' errors looks like a turn that begins ahead."""
+    config = street(seed, output, 30)
+    drive = simulate(config)
+    found = decide_sweep(cache(drive.scan), len(drive))
+    assert found.kind == (config.sweep_sense if output == "raw" else "compensated"), found.sentence
+    if output == "raw":
+        away = np.degrees(found.timing.start_rad) - config.sweep_start_deg
+        assert found.start_known and abs((away + 180.0) % 360.0 - 180.0) <= 10.0
 
 
 @pytest.mark.slow

@@ -320,7 +320,8 @@ def _compare_hypotheses(
     behind = {name: means[best] - means[name] for name in means}
     needed = -np.log(_ERROR_RATE)
     excluded = {name for name in behind if behind[name] > needed}
-    starts = {name: _start(-ratio) for name, ratio in ratios.items()}
+    # By the registration itself: bounded evidence forgives a start beside the right one the points between.
+    starts = {name: _start(found.quadratic.cost(f), evidence.unit) for name, f in FRACTIONS.items()}
     # Compensated points are compared with the turn that fits best.
     raw = best if best != "compensated" else min(_RAW, key=lambda name: behind[name])
     sector, start_known = starts[raw]
@@ -367,12 +368,15 @@ def _log_mean(values: FloatArray) -> float:
     return most + float(np.log(np.mean(np.exp(values - most))))
 
 
-def _start(costs: FloatArray) -> tuple[int, bool]:
-    """Sector at whose border a turn begins, and whether the costs (SECTORS,) [1/2 sigma^2] determine it.
+def _start(costs: FloatArray, units: FloatArray) -> tuple[int, bool]:
+    """Sector at whose border a turn begins, and whether the costs (SECTORS,) [m^2] determine it.
 
     Of starts that fit equally well (no points between them) the one in the middle of the widest run.
+
+    units: (SECTORS,) variance of a residual [m^2].
     """
-    alike = 2.0 * (costs - costs.min()) < 4.0
+    best = int(np.argmin(costs))
+    alike = 2.0 * (costs - costs[best]) < 4.0 * units[best]
     if alike.all():
         return 0, False
     first = int(np.flatnonzero(alike & ~np.roll(alike, 1))[0])

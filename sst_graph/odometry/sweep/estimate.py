@@ -14,6 +14,9 @@ _MAX_FRACTION = 1.3
 """Bound of the share on the way to an estimate: the truth is at most 1."""
 _CONVERGED = 0.005
 """Change of the share below which the iterations end."""
+_POSES_ONLY = 2
+"""Iterations in which only the poses move: what odometry left of their errors looks like a turn that begins
+ahead, and matches made under that one confirm it."""
 _MAX_ITERATIONS = 12
 """Most times that points are matched again."""
 
@@ -148,6 +151,9 @@ def estimate(windows: Sequence[SweepWindow], fraction: float = 0.0, sector: int 
     for number in range(_MAX_ITERATIONS):
         present = fraction, sector
         quadratic, normals = _matched(windows, fraction, sector, number)
+        if number < _POSES_ONLY:
+            _move(windows, normals, np.zeros(1 + SECTORS))
+            continue
         shares = quadratic.free()
         best = int(np.argmin(quadratic.cost(shares)))
         last, fraction = fraction, float(shares[best])

@@ -326,9 +326,14 @@ class SweepWindow:
         found = np.isfinite(distance)
         kept, nearest = chosen[found], nearest[found]
         normals = self._surfaces[a].normals[nearest] @ Ra.T
-        cosine = np.abs(np.einsum("ij,ij->i", normals, self._surfaces[b].normals[kept] @ Rb.T))
-        alike = cosine > _MIN_NORMAL_COSINE
-        kept, nearest, normals = kept[alike], nearest[alike], normals[alike]
+        others = self._surfaces[b].normals[kept] @ Rb.T
+        cosine = np.einsum("ij,ij->i", normals, others)
+        alike = np.abs(cosine) > _MIN_NORMAL_COSINE
+        kept, nearest, cosine = kept[alike], nearest[alike], cosine[alike]
+        # The mean of both: where patches end, errors of one normal are in residual and Jacobian alike, and
+        # pull every point towards the middle of its patch.
+        normals = normals[alike] + np.sign(cosine)[:, None] * others[alike]
+        normals /= np.sqrt(2.0 + 2.0 * np.abs(cosine))[:, None]
         wAs = posed[a].tree.data[nearest]
         residuals = np.einsum("ij,ij->i", normals, wBs[kept] - wAs)
         weights = 1.0 / (1.0 + (residuals / scale) ** 2) ** 2
