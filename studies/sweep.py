@@ -1,6 +1,6 @@
 """Sweeps decided from the scans, on simulated streets. Prints tables.
 
-    OMP_NUM_THREADS=1 python studies/sweep.py decide --streets 40      what the scans tell
+    OMP_NUM_THREADS=1 python studies/sweep.py decide --streets 30      what the scans tell
     OMP_NUM_THREADS=1 python studies/sweep.py calibrate --streets 6    what it costs the calibration
 
 Every street has a rate of 5 to 20 Hz, a speed of 1 to 20 m/s, a sense of rotation, a start of the turn and a
@@ -52,8 +52,8 @@ def decided(config: SimulationConfig) -> SweepDecision:
 
 
 def decide(args: argparse.Namespace) -> None:
-    """Of every street, raw and compensated: right, undecided or wrong, by view."""
-    counts: dict[tuple[str, str], list[int]] = {}
+    """Of every street, raw and compensated: right, undecided or wrong, by view and metres in a turn."""
+    counts: dict[tuple[int, str, str], list[int]] = {}
     print("| street | truth | speed, rate, motion, view | decision | sigmas |\n|---|---|---|---|---|")
     for seed in range(args.seed, args.seed + args.streets):
         for output in args.outputs.split(","):
@@ -63,8 +63,9 @@ def decide(args: argparse.Namespace) -> None:
             found = decided(config)
             seconds = time.perf_counter() - began
             kind = 0 if found.kind == truth else 2 if found.kind in FRACTIONS else 1
-            seen = "full" if config.azimuth_limit_deg == 180.0 else "cropped"
-            counts.setdefault((seen, output), [0, 0, 0])[kind] += 1
+            turn_m = config.speed_mps / config.frame_rate_hz
+            band = next(f"{low:.2f} or more" for low in _BANDS_M if turn_m >= low)
+            counts.setdefault((round(config.azimuth_limit_deg), band, output), [0, 0, 0])[kind] += 1
             how = f"{config.speed_mps:.1f} m/s, {config.frame_rate_hz:.0f} Hz, {config.motion}, "
             worse = ", ".join(f"{name} {sigmas:.1f}" for name, sigmas in found.worse_by.items())
             start = f", start {config.sweep_start_deg:.0f} deg"
@@ -73,9 +74,13 @@ def decide(args: argparse.Namespace) -> None:
                 f"| {seed} | {truth} | {view} | {found.sentence} | {worse} | <!-- {seconds:.0f} s -->",
                 flush=True,
             )
-    print("\n| view | clouds | right | undecided | wrong |\n|---|---|---|---|---|")
-    for (seen, output), (right, open_, wrong) in sorted(counts.items(), reverse=True):
-        print(f"| {seen} | {output} | {right} | {open_} | {wrong} |")
+    print("\n| view deg | m in a turn | clouds | right | undecided | wrong |\n|---|---|---|---|---|---|")
+    for (limit, band, output), (right, open_, wrong) in sorted(counts.items(), reverse=True):
+        print(f"| {limit} | {band} | {output} | {right} | {open_} | {wrong} |")
+
+
+_BANDS_M = (0.3, 0.15, 0.0)
+"""Least metres in a turn by which streets are counted."""
 
 
 def errors(config: SimulationConfig, timed: bool) -> tuple[list[float], str, str]:
@@ -116,7 +121,7 @@ def calibrations(args: argparse.Namespace) -> None:
             sweep_sense=str(rng.choice(["clockwise", "counterclockwise"])),  # type: ignore[arg-type]
             sweep_start_deg=float(rng.choice([180.0, 120.0, -120.0])),
         )
-        for output in ("times", "raw", "compensated"):
+        for output in ("times", *args.outputs.split(",")):
             config = dataclasses.replace(base, sweep_output=output)  # type: ignore[arg-type]
             figures, status, decision = errors(config, output == "times")
             tables.setdefault(output, []).append(figures)
@@ -133,7 +138,7 @@ def main() -> None:
     parser.add_argument("--streets", type=int, default=6)
     parser.add_argument("--frames", type=int, default=30)
     parser.add_argument("--seed", type=int, default=500)
-    parser.add_argument("--outputs", default="compensated,raw", help="decide: which of them")
+    parser.add_argument("--outputs", default="compensated,raw", help="which of them")
     args = parser.parse_args()
     cv2.setNumThreads(1)
     decide(args) if args.what == "decide" else calibrations(args)
