@@ -290,7 +290,7 @@ def test_groups_of_matches_add_up_to_the_registration() -> None:
 def test_a_match_lies_along_the_mean_of_both_normals() -> None:
     """Normals of one scan that are off by an angle turn those of its matches by half of it."""
     hall, angle = _hall(0.0, 0.0, 180.0), 0.1
-    window = Window([hall(k) for k in range(3)], 0.1)
+    window = SweepWindow([hall(k) for k in range(3)], 0.1)
 
     def normals() -> np.ndarray[Any, Any]:
         window.linearized(0.0, 0.0, 9)
