@@ -92,12 +92,13 @@ def test_each_output_of_several_is_whole_or_absent() -> None:
 
 
 @pytest.mark.slow
-def test_a_kill_leaves_nothing_or_all(bench: Bench) -> None:
-    _holds(kill(bench, COMMANDS["simulate"], [0.6, 0.9, 1.0]))
+@pytest.mark.parametrize("command", ["simulate", "calibrate --video"])
+def test_a_kill_leaves_nothing_or_all(bench: Bench, command: str) -> None:
+    _holds(kill(bench, COMMANDS[command], [0.6, 0.9, 1.0]))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", ["segment", "batch"])
+@pytest.mark.parametrize("command", ["segment", "batch", "experiment basin"])
 def test_a_killed_run_that_goes_on_makes_the_same(bench: Bench, command: str) -> None:
     _holds(kill(bench, COMMANDS[command], [0.6, 0.9]))
 
