@@ -74,17 +74,37 @@ def calibrate_arguments(data: Path, desk: Path) -> list[str]:
     return ["calibrate", str(data / "street"), "--frames", "0:3", "--out", str(desk / "out")]
 
 
+def _rig(data: Path, desk: Path) -> list[str]:
+    return [*calibrate_arguments(data, desk), "--camera", "image_2", "image_3", *QUICK]
+
+
+def _with_video(data: Path, desk: Path) -> list[str]:
+    return [*calibrate_arguments(data, desk), *QUICK, "--video", str(desk / "out.gif")]
+
+
 def _track(data: Path, desk: Path) -> list[str]:
     files = ["--out", str(desk / "out.json"), "--checkpoint", str(desk / "checkpoint.npz")]
     return ["track", str(data / "street"), *TRACK, *files]
+
+
+def _track_viewed(data: Path, desk: Path) -> list[str]:
+    return [*_track(data, desk), "--view-save", str(desk / "out.rrd")]
 
 
 def _overlay(data: Path, desk: Path) -> list[str]:
     return ["overlay", str(data / "result"), str(data / "street"), "--out", str(desk / "out.png")]
 
 
+def _overlay_video(data: Path, desk: Path) -> list[str]:
+    return ["overlay", str(data / "result"), str(data / "street"), "--video", str(desk / "out.gif")]
+
+
 def _export(data: Path, desk: Path) -> list[str]:
     return ["export", str(data / "result"), "--force", "--to", "kalibr", "--out", str(desk / "out.yaml")]
+
+
+def _export_marginal(data: Path, desk: Path) -> list[str]:
+    return ["export", str(data / "result"), "--force", "--to", "gtsam", "--out", str(desk / "out.json")]
 
 
 def _evaluate(data: Path, _: Path) -> list[str]:
@@ -112,6 +132,18 @@ def _import(data: Path, desk: Path) -> list[str]:
     return ["import", str(calibration), "--from", "kitti", "--out", str(desk / "out.json")]
 
 
+def _table1(data: Path, desk: Path) -> list[str]:
+    words = [
+        "--data",
+        str(data / "street"),
+        "--methods",
+        "joint",
+        "--set",
+        "calibration.search.enabled=false",
+    ]
+    return ["experiment", "table1", *words, "--out", str(desk / "out.md")]
+
+
 COMMANDS = {
     command.name: command
     for command in (
@@ -119,9 +151,14 @@ COMMANDS = {
             "simulate", lambda _, desk: ["simulate", str(desk / "out"), *SMALL], "out", older=("--seed", "9")
         ),
         Command("calibrate", calibrate_arguments, "out", (0, 3), older=("--image-shift", "1")),
+        Command("calibrate, two cameras", _rig, "out", (0, 3), older=("--image-shift", "1")),
+        Command("calibrate --video", _with_video, "out", (0, 3), older=("--image-shift", "1")),
         Command("track", _track, "out.json", (0, 3)),
+        Command("track --view-save", _track_viewed, "out.json", (0, 3)),
         Command("overlay", _overlay, "out.png", older=("--frame", "1")),
+        Command("overlay --video", _overlay_video, "out.gif", older=("--frames", "0:3")),
         Command("export", _export, "out.yaml", older=("--to", "urdf")),
+        Command("export --to gtsam", _export_marginal, "out.json", older=("--to", "urdf")),
         Command("evaluate", _evaluate, None, prints=True),
         Command(
             "inspect",
@@ -129,6 +166,9 @@ COMMANDS = {
             "out",
             prints=True,
         ),
+        Command("info", lambda data, _: ["info", str(data / "street")], None, prints=True),
+        Command("settings", lambda *_: ["settings"], None, prints=True),
+        Command("completion", lambda *_: ["completion", "bash"], None, prints=True),
         Command("import", _import, "out.json", older=("--camera", "image_2")),
         Command("view", _view, "out.rrd", older=("--frames", "0:1")),
         Command("segment", _segment, "out", goes_on=True, shared=True),
@@ -148,6 +188,7 @@ COMMANDS = {
             "out.md",
             goes_on=True,
         ),
+        Command("experiment table1", _table1, "out.md", goes_on=True),
         Command("demo", lambda _, desk: ["demo", "--out", str(desk / "out")], "out", older=("--seed", "2")),
     )
 }
@@ -156,7 +197,7 @@ COMMANDS = {
 def write_inputs(data: Path) -> None:
     """A street, networks that label it, and a list of drives."""
     data.mkdir(parents=True)
-    write_drive(simulate(STREET), data / "street")
+    write_drive(simulate(STREET), data / "street", stereo=True)
     (data / "drives.txt").write_text(f"{data / 'street'}\n")
     if str(ROOT / "tests") not in sys.path:
         sys.path.append(str(ROOT / "tests"))
@@ -204,6 +245,17 @@ def _entities(path: Path) -> bytes:
     for chunk in RrdReader(path).stream():
         rows[chunk.entity_path] += chunk.num_rows
     return repr(sorted(rows.items())).encode()
+
+
+def each_in(found: State, *states: State) -> bool:
+    """Whether each output is as in one of some states; outputs take their names one after another."""
+    names = {name.partition("/")[0] for one in (found, *states) for name in one}
+    return all(_output(found, name) in [_output(one, name) for one in states] for name in names)
+
+
+def _output(found: State, output: str) -> State:
+    """What is below an output, a file or a folder."""
+    return {name: data for name, data in found.items() if name.partition("/")[0] == output}
 
 
 def is_part(found: State, whole: State) -> bool:

@@ -38,6 +38,7 @@ from checks.fault_commands import (
     Command,
     State,
     calibrate_arguments,
+    each_in,
     is_part,
     state,
     write_inputs,
@@ -172,8 +173,8 @@ def without_checkpoint(found: State) -> State:
 
 
 def holds(command: Command, found: State, whole: State) -> bool:
-    """Whether a folder is as a run that was ended may leave it: nothing or all, or what was done."""
-    return is_part(found, whole) if command.goes_on else found in ({}, whole)
+    """Whether a run that was ended may leave this: nothing or all of an output, or what is done."""
+    return is_part(found, whole) if command.goes_on else each_in(found, {}, whole)
 
 
 def kill(bench: Bench, command: Command, moments: Sequence[float]) -> Row:
@@ -218,7 +219,7 @@ def kill_overwriting(bench: Bench, command: Command, moments: Sequence[float]) -
         row.runs += 1
         row.finished += ended.code in command.codes
         found = without_stages(state(desk))
-        row.check(found in ({**older, **notes}, {**whole, **notes}), f"at {moment:.3f}: {sorted(found)}")
+        row.check(each_in(found, {**older, **notes}, {**whole, **notes}), f"at {moment:.3f}: {sorted(found)}")
         if found != {**older, **notes}:
             lay_out()
     _check_next_run(bench, command, desk, row, {**whole, **notes})
@@ -457,12 +458,13 @@ def all_rows(bench: Bench, moments: int, chosen: Sequence[str], commands: Sequen
         if command.output is not None:
             rows: dict[str, list[Callable[[], Row]]] = {
                 "kill": [lambda c=command: kill(bench, c, times())],  # type: ignore[misc]
+                "overwrite": [lambda c=command: kill_overwriting(bench, c, times())],  # type: ignore[misc]
                 "full": [lambda c=command: full_disk(bench, c, limits)],  # type: ignore[misc]
                 "readonly": [lambda c=command: read_only(bench, c)],  # type: ignore[misc]
                 "writers": [lambda c=command: two_writers(bench, c, 4)],  # type: ignore[misc]
             }
-            if command.older:
-                rows["kill"].append(lambda c=command: kill_overwriting(bench, c, times()))  # type: ignore[misc]
+            if not command.older:
+                del rows["overwrite"]
             if name == "track":
                 rows["resume"] = [lambda c=command: resume(bench, c, times())]  # type: ignore[misc]
         else:
@@ -477,7 +479,7 @@ def all_rows(bench: Bench, moments: int, chosen: Sequence[str], commands: Sequen
                 yield from (make() for make in makers)
 
 
-KINDS = ("kill", "resume", "signals", "full", "readonly", "streams", "writers")
+KINDS = ("kill", "overwrite", "resume", "signals", "full", "readonly", "streams", "writers")
 
 
 def main() -> int:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from checks.fault_commands import COMMANDS
+from checks.fault_commands import COMMANDS, each_in
 from checks.fault_matrix import (
     Bench,
     Row,
@@ -81,13 +81,24 @@ def _holds(row: Row) -> None:
     assert row.runs and row.failures == []
 
 
-@pytest.mark.slow
-def test_a_kill_leaves_nothing_or_all(bench: Bench) -> None:
-    _holds(kill(bench, COMMANDS["simulate"], [0.6, 0.9, 1.0]))
+def test_each_output_of_several_is_whole_or_absent() -> None:
+    whole = {"out/a": b"1", "out/b": b"2", "out.gif": b"3"}
+    assert each_in({}, {}, whole) and each_in(whole, {}, whole)
+    assert each_in({"out/a": b"1", "out/b": b"2"}, {}, whole)  # the video takes its name later
+    assert not each_in({"out/a": b"1"}, {}, whole)
+    assert not each_in({"out.gif": b"half"}, {}, whole)
+    assert not each_in({**whole, "left": b""}, {}, whole)
+    assert not each_in({"out/a": b"1", "out/b": b"2"}, {"out.gif": b"0"}, whole)  # the older one is lost
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", ["segment", "batch"])
+@pytest.mark.parametrize("command", ["simulate", "calibrate --video"])
+def test_a_kill_leaves_nothing_or_all(bench: Bench, command: str) -> None:
+    _holds(kill(bench, COMMANDS[command], [0.6, 0.9, 1.0]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["segment", "batch", "experiment basin"])
 def test_a_killed_run_that_goes_on_makes_the_same(bench: Bench, command: str) -> None:
     _holds(kill(bench, COMMANDS[command], [0.6, 0.9]))
 
@@ -145,7 +156,12 @@ def test_a_full_disk_is_named_and_leaves_nothing(bench: Bench, command: str) -> 
 
 
 @pytest.mark.parametrize(
-    "command", ["simulate", "track", "export", "import", "segment", "view", "batch", "experiment fit"]
+    "command",
+    [
+        *("simulate", "calibrate", "calibrate, two cameras", "calibrate --video", "demo"),
+        *("track", "track --view-save", "export", "export --to gtsam", "overlay --video", "import"),
+        *("segment", "view", "batch", "experiment fit", "experiment basin", "experiment table1"),
+    ],
 )
 def test_a_place_that_cannot_be_written_is_refused_before_the_work(bench: Bench, command: str) -> None:
     _holds(read_only(bench, COMMANDS[command]))
