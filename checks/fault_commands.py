@@ -133,14 +133,8 @@ def _import(data: Path, desk: Path) -> list[str]:
 
 
 def _table1(data: Path, desk: Path) -> list[str]:
-    words = [
-        "--data",
-        str(data / "street"),
-        "--methods",
-        "joint",
-        "--set",
-        "calibration.search.enabled=false",
-    ]
+    words = ["--data", str(data / "street"), "--methods", "joint"]
+    words += ["--set", "calibration.search.enabled=false"]
     return ["experiment", "table1", *words, "--out", str(desk / "out.md")]
 
 

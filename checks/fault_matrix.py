@@ -458,13 +458,12 @@ def all_rows(bench: Bench, moments: int, chosen: Sequence[str], commands: Sequen
         if command.output is not None:
             rows: dict[str, list[Callable[[], Row]]] = {
                 "kill": [lambda c=command: kill(bench, c, times())],  # type: ignore[misc]
-                "overwrite": [lambda c=command: kill_overwriting(bench, c, times())],  # type: ignore[misc]
                 "full": [lambda c=command: full_disk(bench, c, limits)],  # type: ignore[misc]
                 "readonly": [lambda c=command: read_only(bench, c)],  # type: ignore[misc]
                 "writers": [lambda c=command: two_writers(bench, c, 4)],  # type: ignore[misc]
             }
-            if not command.older:
-                del rows["overwrite"]
+            if command.older:
+                rows["overwrite"] = [lambda c=command: kill_overwriting(bench, c, times())]  # type: ignore[misc]
             if name == "track":
                 rows["resume"] = [lambda c=command: resume(bench, c, times())]  # type: ignore[misc]
         else:

@@ -34,7 +34,7 @@ from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate, writ
 from sst_graph.sweep_timing import SweepTiming
 from sst_graph.types import Frame, Guess, Scan
 from studies.edges_streets import source_of
-from studies.sweep import street
+from studies.sweep import decided, street
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 PARKED = DATA / "kitti_2011_09_26_parked"
@@ -347,8 +347,7 @@ def test_a_start_in_view_is_not_taken_for_another_one(seed: int, output: str) ->
     """Evidence that is bounded by group forgives a start beside the right one; and what odometry left of the
     poses' errors looks like a turn that begins ahead."""
     config = street(seed, output, 30)
-    drive = simulate(config)
-    found = decide_sweep(cache(drive.scan), len(drive))
+    found = decided(config)
     assert found.kind == (config.sweep_sense if output == "raw" else "compensated"), found.sentence
     if output == "raw":
         away = np.degrees(found.timing.start_rad) - config.sweep_start_deg
