@@ -213,6 +213,8 @@ def is_whole(value: Any) -> bool:
 
 def _is_finite(value: Any) -> bool:
     if isinstance(value, np.ndarray) and value.ndim == 0:
+        if masked_values(value):  # hides a number, and is NaN as a float
+            return False
         value = value.item()
     if not isinstance(value, int | float | np.integer | np.floating) or isinstance(value, bool):
         return False
@@ -224,6 +226,8 @@ def _is_finite(value: Any) -> bool:
 
 def described(value: Any) -> str:
     """A short word on a value of any type, for messages."""
+    if masked_values(value) and np.ndim(value) == 0:  # type: ignore[arg-type]
+        return "a masked value"
     if isinstance(value, np.ndarray):
         return f"an array of shape {value.shape}"
     if isinstance(value, int) and abs(value) >= 10**_MAX_DIGITS:
