@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pty
+import shutil
 import subprocess
 import sys
 import termios
@@ -126,7 +127,7 @@ def test_a_calibration_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert found["errors"]["qad_deg"] < 5.0 and found["errors_against"] == "the truth"
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh", "tcsh"])
+@pytest.mark.parametrize("shell", ["bash", "zsh", "tcsh", "fish"])
 def test_completion_knows_commands_and_options(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["completion", shell]) == 0
     script = capsys.readouterr().out
@@ -144,6 +145,20 @@ def test_bash_accepts_the_script_and_completes(tmp_path: Path, capsys: pytest.Ca
     )
     done = subprocess.run(["bash", "-c", ask], capture_output=True, text=True)
     assert done.stdout.split() == ["calibrate"], done.stderr
+
+
+@pytest.mark.skipif(shutil.which("fish") is None, reason="fish is not installed")
+def test_fish_accepts_the_script_and_completes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["completion", "fish"]) == 0
+    script = tmp_path / "sst-graph.fish"
+    script.write_text(capsys.readouterr().out)
+    found = {}
+    for line in ("sst-graph calib", "sst-graph calibrate --image-sh", "sst-graph calibrate --method stat"):
+        ask = ["fish", "--no-config", "-c", f"source {script}; complete -C {line!r}"]
+        done = subprocess.run(ask, capture_output=True, text=True)
+        assert not done.stderr
+        found[line.split()[-1]] = [answer.split("\t")[0] for answer in done.stdout.splitlines()]
+    assert found == {"calib": ["calibrate"], "--image-sh": ["--image-shift"], "stat": ["static"]}
 
 
 def test_without_shtab_the_message_names_the_extra(

@@ -35,9 +35,10 @@ def add_completion(commands: Commands) -> argparse.ArgumentParser:
         "completion",
         help=text,
         description=f"{text[0].upper()}{text[1:]}: source <(sst-graph completion bash), or in zsh "
-        "sst-graph completion zsh > a folder of $fpath, as _sst-graph.",
+        "sst-graph completion zsh > a folder of $fpath, as _sst-graph, or in fish "
+        "sst-graph completion fish > ~/.config/fish/completions/sst-graph.fish.",
     )
-    completion.add_argument("shell", choices=("bash", "zsh", "tcsh"))
+    completion.add_argument("shell", choices=("bash", "zsh", "tcsh", "fish"))
     return completion
 
 
