@@ -203,16 +203,29 @@ def _parsed(
 ) -> Any:
     try:
         value = parse()
-        _check_values(value, max_depth)
+        check_values(value, max_depth)
     except RecursionError:
         raise DataError(place, f"{language} nested too deeply", f"at most {max_depth} levels") from None
     except ValueError as error:  # JSONDecodeError, TOMLDecodeError and those of the hooks below
-        raise DataError(place, f"no {language} ({first_line(error)})", expected) from None
+        raise DataError(place, f"no {language} ({said_of_values(error)})", expected) from None
     return value
 
 
-def _check_values(value: Any, max_depth: int) -> None:
-    """Depth, whole numbers (TOML's parser has no hook for them) and text of a parsed document."""
+def said_of_values(error: Exception) -> str:
+    """What a parser's error says, on one line; not what Python advises for thousands of digits."""
+    return _TOO_MANY_DIGITS if "int_max_str_digits" in str(error) else first_line(error)
+
+
+_TOO_MANY_DIGITS = f"a whole number of more than {MAX_DIGITS} digits"
+
+
+def check_values(value: Any, max_depth: int) -> None:
+    """Depth, whole numbers (parsers of TOML and YAML have no hook for them) and text of a parsed document.
+
+    Raises:
+        RecursionError: more than ``max_depth`` levels.
+        ValueError: a number of more than MAX_DIGITS digits, or half a character.
+    """
     level, depth = [value], 0
     while level:
         depth += 1
@@ -229,7 +242,7 @@ def _check_values(value: Any, max_depth: int) -> None:
                 if not item.isascii() and any("\ud800" <= c <= "\udfff" for c in item):
                     raise ValueError("a lone surrogate in a string")
             elif isinstance(item, int) and abs(item) >= 10**MAX_DIGITS:
-                raise ValueError(f"a whole number of more than {MAX_DIGITS} digits")
+                raise ValueError(_TOO_MANY_DIGITS)
         level = below
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sst_graph.errors import DataError, count_of, one_line, optional_module
-from sst_graph.files.reading import FileKind, read_text
+from sst_graph.files.reading import FileKind, check_values, read_text, said_of_values
 
 YAML = FileKind("a YAML file", 64 * 1024)
 _MAX_DEPTH = 16
@@ -24,7 +24,8 @@ def parse_yaml(text: str, place: str | Path) -> dict[str, Any]:
     """The table in a YAML text; a matrix of OpenCV is a table of rows, cols, dt, data.
 
     Raises:
-        DataError: no YAML, anchors and aliases, tags of objects, deep nesting, a name twice, no table.
+        DataError: no YAML, anchors and aliases, tags of objects, deep nesting, a name twice, a whole number
+            of more than MAX_DIGITS digits, no table.
         MissingDependencyError: PyYAML is not installed.
     """
     without = f"{place}: reading YAML needs PyYAML, which is not installed"
@@ -51,10 +52,10 @@ def parse_yaml(text: str, place: str | Path) -> dict[str, Any]:
     try:
         _check_events(yaml, text)
         value = yaml.load(text, Loader)  # a SafeLoader
+        check_values(value, _MAX_DEPTH + 1)
     except (yaml.YAMLError, ValueError, TypeError, OverflowError, AttributeError, RecursionError) as error:
-        raise DataError(
-            place, f"no YAML ({one_line(error):.200})", "numbers, text, lists and tables"
-        ) from None
+        found = said_of_values(error) if isinstance(error, ValueError) else one_line(error)
+        raise DataError(place, f"no YAML ({found:.200})", "numbers, text, lists and tables") from None
     if not isinstance(value, dict):
         raise DataError(place, f"a YAML {type(value).__name__}", "a table")
     return value

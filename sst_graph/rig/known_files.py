@@ -66,7 +66,7 @@ def _of_chain(
 ) -> list[tuple[str, int, gtsam.Pose3]]:
     """The rig's cameras in the order of a chain: name, place in it, pose of the chain's first camera."""
     entries = [(key, value) for key, value in table.items() if isinstance(value, dict)]
-    if all(re.fullmatch(r"cam\d+", str(key)) for key, _ in entries):
+    if all(re.fullmatch(r"cam\d{1,9}", str(key)) for key, _ in entries):
         entries.sort(key=lambda entry: int(str(entry[0])[3:]))
     names = {str(key): str(value.get("rostopic", "")) for key, value in entries}
     found: list[tuple[str, int, gtsam.Pose3]] = []

@@ -26,6 +26,7 @@ from sst_graph.data.point_files.cloud import (
     structured_fields,
 )
 from sst_graph.errors import DataError, count_of, first_line
+from sst_graph.files.reading import MAX_DIGITS
 
 _MAX_BYTES = 512 * 1024 * 1024
 """Of one array, unpacked."""
@@ -105,6 +106,8 @@ def _array(data: bytes, path: Path) -> NDArray[Any]:
             np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         )
         shape, fortran, dtype = read_header(stream, max_header_size=_MAX_HEADER)
+        if any(abs(length) >= 10**MAX_DIGITS for length in shape):
+            raise ValueError(f"a length of more than {MAX_DIGITS} digits")
     except (*_BROKEN, RecursionError, MemoryError) as error:
         raise DataError(path, f"no .npy file ({first_line(error)})", "an array that NumPy wrote") from None
     if (

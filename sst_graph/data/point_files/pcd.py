@@ -25,6 +25,7 @@ from sst_graph.data.point_files.cloud import (
     text_records,
 )
 from sst_graph.errors import DataError, count_of
+from sst_graph.files.reading import MAX_DIGITS
 
 _MAX_HEADER = 64 * 1024
 _TYPES = {
@@ -70,13 +71,9 @@ def read_pcd(data: bytes, path: Path) -> PointFields:
 
 def _whole_numbers(name: str, words: list[str], path: Path) -> list[int]:
     """One or more, of a line of the header."""
-    try:
-        found = [int(word) for word in words]
-    except ValueError:
-        found = []
-    if not found:
+    if not words or not all(word.isdecimal() and len(word) <= MAX_DIGITS for word in words):
         raise DataError(path, f"{name} {' '.join(words):.40}", "whole numbers in this line of the header")
-    return found
+    return [int(word) for word in words]
 
 
 def _header(data: bytes, path: Path) -> PcdHeader:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from sst_graph.data.ros.livox import CUSTOM, OLDER_CUSTOM, custom_points
 from sst_graph.errors import DataError, SstGraphError, count_of, one_line, optional_module
+from sst_graph.files.reading import MAX_DIGITS
 
 WHOLE_BAG = (
     "a whole ROS 1 bag, rosbag2 folder or mcap file; one that was cut short is repaired with "
@@ -93,6 +94,8 @@ class Bag:
             for one in connections:
                 if (type(one.topic), type(one.msgtype), type(one.msgcount)) != (str, str, int):
                     raise ValueError(f"topic {one.topic!r:.40} of type {one.msgtype!r:.40}")
+                if not 0 <= one.msgcount < 10**MAX_DIGITS:
+                    raise ValueError(f"topic {one.topic!r:.40} with a count of messages that is none")
         except Exception as error:
             stack.close()
             profile = _profile(self.path)

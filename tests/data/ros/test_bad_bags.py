@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import sys
 from collections.abc import Callable, Sequence
@@ -297,6 +298,17 @@ def test_a_folder_whose_metadata_lacks_entries(
     (path / "metadata.yaml").write_text(text)
     line = refused(capsys, path)
     assert "cannot be read" in line and "NoneType" not in line and "Error" not in line
+
+
+@pytest.mark.parametrize("count", ["-1", "9" * 400, "0x" + "f" * 6000])
+def test_a_count_of_messages_that_is_none(
+    count: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = made(tmp_path, fill)
+    metadata = path / "metadata.yaml"
+    metadata.write_text(re.sub("message_count: [0-9]+", f"message_count: {count}", metadata.read_text()))
+    line = refused(capsys, path)
+    assert "cannot be read" in line and "a count of messages that is none" in line
 
 
 def test_an_mcap_file_of_other_messages_than_those_of_ros_2(
