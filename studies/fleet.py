@@ -80,7 +80,7 @@ for _setting in (
     SETTINGS += ["--set", _setting]
 """Of both runs, to save time: the street's own tests of its assumptions are of no concern here."""
 FIRST_DAY = date(2026, 3, 2)
-DRIVE, DASK_WORKER = "sst_graph calibrate", "spawn_main"
+DRIVE, DASK_WORKER = "sst_graph.cli.one_drive calibrate", "spawn_main"
 """In the command lines of a drive's process, and of a Dask worker's."""
 
 

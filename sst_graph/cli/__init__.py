@@ -13,6 +13,10 @@ EXIT_BAD_INPUT = 2
 EXIT_NOT_TRUSTED = 3
 EXIT_INTERRUPTED = 130
 EXIT_READER_GONE = 141
+EXIT_DEFECT = 70
+EXIT_NOT_WRITTEN = 74
+"""Of :mod:`sst_graph.cli.one_drive` alone, which tells data that are refused from what is no fault of theirs;
+for people both are EXIT_BAD_INPUT."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

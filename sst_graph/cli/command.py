@@ -11,7 +11,13 @@ import sys
 import traceback
 from collections.abc import Sequence
 
-from sst_graph.cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_READER_GONE
+from sst_graph.cli import (
+    EXIT_BAD_INPUT,
+    EXIT_DEFECT,
+    EXIT_INTERRUPTED,
+    EXIT_NOT_WRITTEN,
+    EXIT_READER_GONE,
+)
 from sst_graph.cli.messages import StreamError, complain, flush, loudness
 from sst_graph.cli.options import build_parser
 from sst_graph.errors import ConfigError, SstGraphError, printable
@@ -21,12 +27,15 @@ _LONGEST = 390
 """Characters of what was said elsewhere, or of a place that the system names."""
 
 
-def run(argv: Sequence[str], own_process: bool = False) -> int:
+def run(argv: Sequence[str], own_process: bool = False, tells_apart: bool = False) -> int:
     """Run the command that ``argv`` names; its exit code (:func:`sst_graph.cli.main`).
 
     Args:
         own_process: its process runs nothing else, so that progress is shown in lines, too.
+        tells_apart: what is no fault of the input has exit codes of its own (:mod:`sst_graph.cli.one_drive`).
     """
+    not_written = EXIT_NOT_WRITTEN if tells_apart else EXIT_BAD_INPUT
+    defect = EXIT_DEFECT if tells_apart else EXIT_BAD_INPUT
     try:
         code = _run(argv, own_process)
         flush()
@@ -41,18 +50,20 @@ def run(argv: Sequence[str], own_process: bool = False) -> int:
     except KeyboardInterrupt:
         return _failed("interrupted", EXIT_INTERRUPTED)
     except OSError as error:
-        return _failed(printable(_sentence(error), _LONGEST), EXIT_BAD_INPUT)
+        return _failed(printable(_sentence(error), _LONGEST), not_written)
     except SstGraphError as error:
-        return _failed(str(error), EXIT_BAD_INPUT)
+        # A setting that the system refuses is a place for the output.
+        by_system = isinstance(error, ConfigError) and isinstance(error.__cause__, OSError)
+        return _failed(str(error), not_written if by_system else EXIT_BAD_INPUT)
     except MemoryError as error:
         needed = f" ({' '.join(str(error).split())})" if str(error) else ""
         advice = "raise the limit of this process, or take fewer --frames"
-        return _failed(printable(f"not enough memory{needed}: {advice}", _LONGEST), EXIT_BAD_INPUT)
+        return _failed(printable(f"not enough memory{needed}: {advice}", _LONGEST), defect)
     except Exception as error:
         if not own_process:
             raise
         _LOG.debug("where it was", exc_info=error)
-        return _failed(_unexpected(error), EXIT_BAD_INPUT)
+        return _failed(_unexpected(error), defect)
 
 
 def _unexpected(error: Exception) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import re
 import sys
@@ -24,7 +25,8 @@ from sst_graph.result import read_result
 DRIVES, RECORDS = "drives", "records"
 RESULT = "calibration.json"
 
-_EXIT_DONE, _EXIT_BAD_INPUT, _EXIT_NOT_TRUSTED = 0, 2, 3
+_EXIT_DONE, _EXIT_BAD_INPUT, _EXIT_NOT_TRUSTED, _EXIT_NOT_WRITTEN = 0, 2, 3, 74
+_FULL = (errno.ENOSPC, errno.EDQUOT)
 MOST_KILLS = 10
 """Attempts that others may end (the machine is taken away, an operator, ...) before a drive is given up.
 
@@ -34,7 +36,7 @@ runs would keep a batch for ever.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _UNFINISHED = re.compile(rf"\.(.+?)(?:\.[0-9a-f]{{16}})?{re.escape(SUFFIX)}$")
 """Name of an unfinished result beside its own."""
-_PROGRAM_MODULE, _SAID_BY_IT = "sst_graph", "sst-graph: "
+_PROGRAM_MODULE, _SAID_BY_IT = "sst_graph.cli.one_drive", "sst-graph: "
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,7 @@ class Job:
         out: the batch's folder.
         folder: where the program was started: relative paths begin there.
         limits: of one attempt.
-        retries: further attempts after a crash, or where something could not be copied.
+        retries: further attempts after a crash, or where something could not be copied or written.
     """
 
     drive: ListedDrive
@@ -145,31 +147,40 @@ def _is_whole(job: Job, is_there: bool) -> bool:
 
 
 def _attempt(job: Job) -> Record:
-    """One attempt; what cannot be copied is a failure of the storage."""
-    with scratch_folder() as scratch:
+    """One attempt; what cannot be copied, and a disk without room for it, are failures of the storage."""
+    try:
+        with scratch_folder() as scratch:
+            return _attempt_in(scratch, job)
+    except OSError as error:
+        return _failed(job, "storage", str(error))
+
+
+def _attempt_in(scratch: Path, job: Job) -> Record:
+    """One attempt with a folder of its own."""
+    try:
+        data = _data(job, scratch)
+    except (SstGraphError, OSError) as error:
+        return _failed(job, "storage", str(error))
+    local = job.result.path if job.result.is_local else scratch / "result"
+    try:
+        ending = _calibrated(job, data, local)
+    except OSError as error:
+        status: Status = "storage" if error.errno in _FULL else "crash"
+        return _failed(job, status, f"no process could be started: {error}")
+    cost = Cost(1, ending.wall_s, ending.cpu_s, ending.peak_bytes, _size(data))
+    if ending.limit or ending.code not in (_EXIT_DONE, _EXIT_NOT_TRUSTED):
+        if not has_ended():  # who ends a batch cleans up after all of its drives
+            _clean(local)
+        return replace(_of_ending(job, ending), cost=cost)
+    record = _of_result(job, local)
+    if record is None:
+        return replace(_failed(job, "crash", "left no whole result"), cost=cost, log=ending.log)
+    if not job.result.is_local:
         try:
-            data = _data(job, scratch)
+            job.result.upload(local)
         except (SstGraphError, OSError) as error:
-            return _failed(job, "storage", str(error))
-        local = job.result.path if job.result.is_local else scratch / "result"
-        try:
-            ending = _calibrated(job, data, local)
-        except OSError as error:
-            return _failed(job, "crash", f"no process could be started: {error}")
-        cost = Cost(1, ending.wall_s, ending.cpu_s, ending.peak_bytes, _size(data))
-        if ending.limit or ending.code not in (_EXIT_DONE, _EXIT_NOT_TRUSTED):
-            if not has_ended():  # who ends a batch cleans up after all of its drives
-                _clean(local)
-            return replace(_of_ending(job, ending), cost=cost)
-        record = _of_result(job, local)
-        if record is None:
-            return replace(_failed(job, "crash", "left no whole result"), cost=cost, log=ending.log)
-        if not job.result.is_local:
-            try:
-                job.result.upload(local)
-            except (SstGraphError, OSError) as error:
-                return replace(_failed(job, "storage", str(error)), cost=cost)
-        return replace(record, cost=cost)
+            return replace(_failed(job, "storage", str(error)), cost=cost)
+    return replace(record, cost=cost)
 
 
 def _data(job: Job, scratch: Path) -> Path:
@@ -210,6 +221,8 @@ def _of_ending(job: Job, ending: Ending) -> Record:
         status, reason = "time_limit", f"took more than {job.limits.wall_s:g} s"
     elif ending.code == _EXIT_BAD_INPUT and said:
         status, reason = "bad_input", said
+    elif ending.code == _EXIT_NOT_WRITTEN:
+        status, reason = "storage", said or "the result could not be written"
     elif ending.from_outside and not ending.short_of_memory:
         status, reason = "killed", f"ended from outside by {ending.words} after {ending.wall_s:.1f} s"
     elif ending.from_outside:

@@ -36,8 +36,8 @@ Status = Literal[
     "not_run",
 ]
 """The result's own status, or why there is none: the command refused the data (``bad_input``), its process
-ended by itself (``crash``), by others (``killed``) or at a limit, the data or the result could not be copied
-(``storage``), the batch ended before (``not_run``)."""
+ended by itself (``crash``), by others (``killed``) or at a limit, the data could not be copied or the result
+not be written (``storage``), the batch ended before (``not_run``)."""
 WITH_RESULT = ("ok", "unobservable", "not_converged")
 
 ATTENTION = (

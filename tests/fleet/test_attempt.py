@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import os
 import shutil
 from pathlib import Path
@@ -20,7 +21,7 @@ from sst_graph.fleet.record import Record
 
 FAULTS = '''
 """Python runs this before the program: faults of a drive's process, by the drive's name."""
-import ctypes, os, pathlib, signal, sys, time
+import ctypes, os, pathlib, resource, signal, sys, time
 if "calibrate" in sys.orig_argv:
     name = pathlib.Path(sys.orig_argv[sys.orig_argv.index("calibrate") + 1]).name
     log = pathlib.Path(__file__).with_name(name)
@@ -38,6 +39,10 @@ if "calibrate" in sys.orig_argv:
         ctypes.string_at(0)
     if kind == "endless":
         time.sleep(600)
+    if kind == "full" and tries <= int(times):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2000, resource.RLIM_INFINITY))
+    if kind == "defect":
+        sys.modules["sst_graph.cli.commands.calibrate"] = None
     if kind == "greedy":
         held = []
         while True:
@@ -56,12 +61,10 @@ def faults(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def attempted(name: str, tmp_path: Path, retries: int) -> Record:
-    """The record of a drive that does not exist: an attempt that is let run ends as bad input."""
-    job = Job(
-        ListedDrive(name, Place(str(tmp_path / name))), (), Place(str(tmp_path / "out")), "/", retries=retries
-    )
-    return run_drive(job)
+def attempted(name: str, tmp_path: Path, retries: int, options: tuple[str, ...] = ()) -> Record:
+    """The record of a drive; where none is there, an attempt that is let run ends as bad input."""
+    drive, out = ListedDrive(name, Place(str(tmp_path / name))), Place(str(tmp_path / "out"))
+    return run_drive(Job(drive, options, out, "/", retries=retries))
 
 
 @pytest.mark.parametrize("name", ["killed-3", "terminated-3"])
@@ -83,6 +86,38 @@ def test_kills_and_crashes_are_counted_apart(faults: Path, tmp_path: Path) -> No
     record = attempted("alternating", tmp_path, retries=1)
     assert (record.status, record.cost.attempts) == ("crash", 4)
     assert "SIGSEGV" in record.reason
+
+
+def test_a_result_that_cannot_be_written_is_no_fault_of_the_data(
+    kitti_drive: Path, faults: Path, tmp_path: Path
+) -> None:
+    """The disk is full at first: the drive is tried again, by the same batch or by the next one."""
+    for name in ("full-1", "full-2"):
+        shutil.copytree(kitti_drive.parents[1], tmp_path / name)
+    given_up = attempted("full-2", tmp_path, retries=0, options=("--no-report",))
+    assert (given_up.status, given_up.cost.attempts) == ("storage", 1)
+    assert "out/drives/full-2" in given_up.reason and "File too large" in given_up.reason
+    assert attempted("full-2", tmp_path, retries=1, options=("--no-report",)).has_result
+    again = attempted("full-1", tmp_path, retries=1, options=("--no-report",))
+    assert again.has_result and again.cost.attempts == 2
+
+
+def test_no_room_for_copies_and_notes_is_a_failure_of_the_storage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", "/tmp/x")
+
+    monkeypatch.setattr("sst_graph.fleet.isolated.tempfile.TemporaryFile", full)
+    assert attempted("a", tmp_path, retries=0).status == "storage"
+    monkeypatch.setattr(Path, "mkdir", full)
+    assert attempted("a", tmp_path, retries=0).status == "storage"
+
+
+def test_a_defect_of_the_program_is_a_crash(faults: Path, tmp_path: Path) -> None:
+    record = attempted("defect", tmp_path, retries=1)
+    assert (record.status, record.cost.attempts) == ("crash", 2)
+    assert "exit code 70" in record.reason and "please report it" in record.reason
 
 
 def test_the_kernel_short_of_memory_is_a_crash(
