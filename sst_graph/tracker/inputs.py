@@ -23,7 +23,7 @@ from sst_graph.odometry.visual import ImagePair, next_pair
 from sst_graph.tracker.by_edges.kinds import by_edges
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.estimate import OnlineEstimate
-from sst_graph.tracker.storage.resume import FirstFrames
+from sst_graph.tracker.storage.resume import SeenFrames
 from sst_graph.tracker.window.window import FARTHEST_NS, Window
 from sst_graph.types import CameraImage, Scan
 from sst_graph.validation import checked_image, checked_scan
@@ -174,7 +174,7 @@ class SensorInputs:
         stamps: intervals of both sensors' stamps.
         image_order, scan_order: which stamps may come next.
         frozen: whether a sensor repeats its last frame.
-        first_frames: by which a drive is recognized when a tracker is resumed.
+        seen: by which a drive is recognized when a tracker is resumed.
         last_scan: the newest scan.
         failures: why scans or images in a row could not be used.
     """
@@ -184,7 +184,7 @@ class SensorInputs:
         self.camera, self.config = camera, config
         self.window = Window(camera, config.window, searched_scans, config.calibration.classes)
         self.image_order, self.scan_order = StampOrder("image", True), StampOrder("scan", False)
-        self.first_frames = FirstFrames()
+        self.seen = SeenFrames()
         self.last_scan: Scan | None = None
         self.failures: deque[str] = deque(maxlen=_MAX_FAILURES)
         self._restart_motion()
@@ -243,7 +243,7 @@ class SensorInputs:
         features = image_features(self.window.next_image, image, calibration.classes, calibration.image_edges)
         self.window.add_image(features, self._image_motion(image, estimate))
         self._forget_images(estimate)
-        self.first_frames.add(image)
+        self.seen.add(image)
 
     def add_scan(
         self, scan: Scan, clock_step_ns: int, estimate: OnlineEstimate, frame: int | None = None
@@ -268,7 +268,7 @@ class SensorInputs:
         self.frozen.add_scan(scan, self.window.latest_step()[1])
         self.last_scan = scan
         self._forget_images(estimate)
-        self.first_frames.add(scan)
+        self.seen.add(scan)
         self.failures.clear()
         alarm = self.config.alarm
         return jump if alarm.enabled and alarm.stamps else None

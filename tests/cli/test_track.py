@@ -10,9 +10,11 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import streets
@@ -150,20 +152,45 @@ def test_resumed_on_other_frames_or_settings(
     assert saved.read_bytes() == before
 
 
+def _other_scan(drive: Path, number: int) -> None:
+    path = sorted(drive.rglob("velodyne/*.bin"))[number]
+    points = np.fromfile(path, "<f4")
+    points[0] += 0.01
+    points.tofile(path)
+
+
+def _other_picture(drive: Path, number: int) -> None:
+    path = sorted(drive.rglob("image_2/*.png"))[number]
+    pixels = cv2.imread(str(path))
+    pixels[5, 5] ^= 1
+    cv2.imwrite(str(path), pixels)
+
+
+def _other_mask(drive: Path, number: int) -> None:
+    path = sorted(drive.rglob("semantic_2/*.png"))[number]
+    mask = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(path), mask[:, ::-1])
+
+
+@pytest.mark.parametrize("frame", [0, 4, 7], ids=["first", "middle", "newest"])
+@pytest.mark.parametrize("change", [_other_scan, _other_picture, _other_mask])
 def test_resumed_on_another_drive(
-    street: Path, saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    street: Path,
+    saved: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    change: Callable[[Path, int], None],
+    frame: int,
 ) -> None:
-    """The same sensors, stamps and masks, one point of the newest scan or of an early one changed."""
-    for scan in (0, 7):
-        other = tmp_path / f"other{scan}"
-        shutil.copytree(street, other)
-        path = sorted(other.rglob("velodyne/*.bin"))[scan]
-        points = np.fromfile(path, "<f4")
-        points[0] += 0.01
-        points.tofile(path)
-        assert main(["track", str(other), *AT_ONCE, "--checkpoint", str(saved), "--resume"]) == 2
-        captured = capsys.readouterr()
-        assert captured.out == "" and "another drive (another scan of" in captured.err
+    """The same sensors and stamps; one point, pixel or mask of one frame that was used is another."""
+    other = tmp_path / "other"
+    shutil.copytree(street, other)
+    change(other, frame)
+    assert main(["track", str(other), *AT_ONCE, "--checkpoint", str(saved), "--resume"]) == 2
+    captured = capsys.readouterr()
+    sensor = "scan" if change is _other_scan else "image"
+    stamp_ns = round(1e9 * np.loadtxt(next(street.rglob("times.txt")))[frame])
+    assert captured.out == "" and f"another drive (another {sensor} of {stamp_ns} ns" in captured.err
 
 
 @pytest.mark.slow

@@ -217,10 +217,11 @@ def _inputs(tracker: Any) -> Any:
         lambda tracker: _nodes(tracker, "object")[1].__setitem__(1, "sst_graph.types:Scan"),
         lambda tracker: tracker.clear(),
         lambda tracker: _attribute(tracker, "setup").__setitem__(1, None),
-        lambda tracker: _attribute(_inputs(tracker), "first_frames").__setitem__(1, None),
-        lambda tracker: _attribute(_attribute(_inputs(tracker), "first_frames")[1], "digests")[1][1][
-            0
-        ].__setitem__(1, 7),
+        lambda tracker: _attribute(_inputs(tracker), "seen").__setitem__(1, None),
+        lambda tracker: _attribute(_attribute(_inputs(tracker), "seen")[1], "scans").__setitem__(1, 7),
+        lambda tracker: _attribute(_attribute(_inputs(tracker), "seen")[1], "images")[1].__setitem__(
+            2, [6, 1]
+        ),
         lambda tracker: _attribute(_attribute(_inputs(tracker), "scan_order")[1], "newest_ns").__setitem__(
             1, "late"
         ),

@@ -9,6 +9,7 @@ from sst_graph import Tracker, TrackerConfig
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.files.object_store import stored
 from sst_graph.tracker.inputs import _MAX_IMAGES
+from sst_graph.tracker.storage import resume
 from sst_graph.types import CameraImage, Frame, Scan
 
 CAMERA = PinholeCamera(8.0, 8.0, 4.0, 3.0, 9, 7)
@@ -37,7 +38,8 @@ def _size(tracker: Tracker) -> int:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sensors", ["images", "scans", "both", "scans die", "images die"])
-def test_what_is_kept_is_bounded(sensors: str) -> None:
+def test_what_is_kept_is_bounded(sensors: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resume, "MOST", 300)
     tracker = Tracker(CAMERA, TrackerConfig())
     sizes = []
     for k in range(FRAMES):
@@ -51,6 +53,14 @@ def test_what_is_kept_is_bounded(sensors: str) -> None:
         if k % 200 == 99 and 800 < k < FRAMES - 100:
             sizes.append(_size(tracker))
     assert max(sizes) < 1.1 * min(sizes) and max(sizes) < 2e6
+
+
+def test_the_first_and_the_latest_frames_are_recognized(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resume, "MOST", 5)
+    seen = resume.SeenFrames()
+    for k in range(20):
+        seen.add(_scan(k))
+    assert (seen.scans[:, 0] // PERIOD_NS).tolist() == [0, 1, 2, 15, 16, 17, 18, 19]
 
 
 def test_images_at_any_rate_are_bounded() -> None:
