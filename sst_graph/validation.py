@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError, count_of
-from sst_graph.factors.arguments import described, masked_values
+from sst_graph.factors.arguments import described, is_whole, masked_values
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.files.checked_values import checked_pose, checked_time_offset_s, pinhole_camera
 from sst_graph.timestamps import LATEST_NS
@@ -34,6 +34,40 @@ MOST_STRETCH = 1e6
 _IS_CLASS = np.isin(np.arange(256), [int(c) for c in SemanticClass])
 _FIRST_UNKNOWN = int(np.argmin(_IS_CLASS))
 """All smaller numbers are classes."""
+
+
+def checked_position(position: object, count: int, slices: bool = False) -> int:
+    """Position of one of ``count`` frames, from 0; those below zero count from the end.
+
+    Args:
+        slices: whether a slice would have done, for the message.
+
+    Raises:
+        DataError: no whole number.
+        IndexError: no frame there, by which Python knows the end of a sequence.
+    """
+    if not is_whole(position):
+        raise DataError(
+            "position of a frame", described(position), f"a whole number{', or a slice' * slices}"
+        )
+    number = int(position)  # type: ignore[call-overload]
+    if not -count <= number < count:
+        raise IndexError(f"frame {described(number)}: the drive has {count}")
+    return number % count
+
+
+def checked_slice(positions: slice, count: int) -> slice:
+    """Positions of some of ``count`` frames.
+
+    Raises:
+        DataError: a bound or a step that is no whole number, or a step of zero.
+    """
+    try:
+        positions.indices(count)
+    except (TypeError, ValueError):
+        parts = ", ".join(map(described, (positions.start, positions.stop, positions.step)))
+        raise DataError("slice of frames", parts, "whole numbers or None, and no step of 0") from None
+    return positions
 
 
 def checked_scan(scan: object, place: str = "scan", fewest: int = 1) -> Scan:

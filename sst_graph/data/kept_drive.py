@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import overload
 
 import gtsam
 
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.types import CameraImage, Frame, GroundTruth, Scan, Source
+from sst_graph.validation import checked_position, checked_slice
 
 
 @dataclass(frozen=True)
@@ -41,8 +43,20 @@ class KeptDrive:
     def __len__(self) -> int:
         return len(self.frames)
 
-    def __getitem__(self, position: int) -> Frame:
-        return self.frames[position]
+    @overload
+    def __getitem__(self, position: int) -> Frame: ...
+    @overload
+    def __getitem__(self, position: slice) -> KeptDrive: ...
+    def __getitem__(self, position: int | slice) -> Frame | KeptDrive:
+        """Frame at a position, or the drive restricted to a slice of positions.
+
+        Raises:
+            DataError: neither a whole number nor a slice.
+            IndexError: no frame at this position.
+        """
+        if isinstance(position, slice):
+            return replace(self, frames=self.frames[checked_slice(position, len(self))])
+        return self.frames[checked_position(position, len(self), slices=True)]
 
     def __iter__(self) -> Iterator[Frame]:
         return iter(self.frames)

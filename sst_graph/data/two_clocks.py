@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Generic, TypeVar, overload
+from typing import Generic, Self, TypeVar, overload
 
 import gtsam
 import numpy as np
@@ -20,6 +20,7 @@ from sst_graph.factors.camera import PinholeCamera
 from sst_graph.sweep_timing import SweepStamp
 from sst_graph.timestamps import check_rising
 from sst_graph.types import CameraImage, Frame, GroundTruth, Scan
+from sst_graph.validation import checked_position, checked_slice
 
 T = TypeVar("T")
 
@@ -132,7 +133,20 @@ class IndexedSource(ABC):
 
     def frame_number(self, position: int) -> int:
         """Index of the frame at a position; nothing is read."""
-        return self.indices[position]
+        return self._index(position)
+
+    def _index(self, position: int) -> int:
+        """Index of the frame at a position.
+
+        Raises:
+            DataError: no whole number.
+            IndexError: no frame at this position.
+        """
+        return self.indices[checked_position(position, len(self), slices=True)]
+
+    def _part(self, positions: slice) -> Self:
+        """The drive restricted to a slice of positions."""
+        return replace(self, indices=self.indices[checked_slice(positions, len(self))])
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,12 +183,12 @@ class TwoClockSource(IndexedSource):
         """Frame at a position (read from disk), or the drive restricted to a slice of positions.
 
         Raises:
-            DataError: a file of the frame cannot be used.
+            DataError: a file of the frame cannot be used; neither a whole number nor a slice.
             IndexError: no frame at this position.
         """
         if isinstance(position, slice):
-            return replace(self, indices=self.indices[position])
-        return Frame(self.indices[position], self.read_scan(position), self.read_image(position))
+            return self._part(position)
+        return Frame(self._index(position), self.read_scan(position), self.read_image(position))
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -208,12 +222,12 @@ class TwoClockSource(IndexedSource):
 
     def read_scan(self, position: int) -> Scan | None:
         """Scan of the frame at a position; errors as of the frame."""
-        place = self.places[self.indices[position]]
+        place = self.places[self._index(position)]
         return None if place.scan is None else self.scans.read(place.scan)
 
     def read_image(self, position: int) -> CameraImage | None:
         """Image of the frame at a position; errors as of the frame."""
-        place = self.places[self.indices[position]]
+        place = self.places[self._index(position)]
         return None if place.image is None else self.images.read(place.image)
 
 

@@ -11,6 +11,7 @@ from sst_graph.data.source_view import SourceView
 from sst_graph.features.compact_objects import find_compact_objects
 from sst_graph.features.ground import on_ground
 from sst_graph.types import Frame, Scan, SemanticClass, Source
+from sst_graph.validation import checked_position
 
 _NEAREST_M = 1.5
 """Nearer points may be of the own vehicle [m]."""
@@ -24,7 +25,8 @@ class GeometricallyLabelled(SourceView):
         self.source = source
 
     def __getitem__(self, position: int) -> Frame:
-        """Frame at a position; IndexError as the source's own."""
+        """Frame at a position; errors as :func:`~sst_graph.validation.checked_position`, and its own."""
+        position = checked_position(position, len(self))
         frame = frame_at(self.source, position)
         return frame if frame.scan is None else replace(frame, scan=labelled_by_geometry(frame.scan))
 

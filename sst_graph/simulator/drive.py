@@ -21,6 +21,7 @@ from sst_graph.simulator.lidar import Lidar, make_lidar
 from sst_graph.simulator.street import Street, build_street, is_instance
 from sst_graph.simulator.surfaces import SEMANTIC_CLASS, FaceKind
 from sst_graph.types import CameraImage, FloatArray, Frame, GroundTruth, Scan
+from sst_graph.validation import checked_position
 
 VIEW_RANGE_M = 140.0
 """Static things farther than this are not in the picture [m]."""
@@ -117,6 +118,7 @@ class SimulatedDrive:
         """Frame at ``position``; negative positions count from the end.
 
         Raises:
+            DataError: no whole number.
             IndexError: beyond the drive.
         """
         index = self._checked(position)
@@ -164,9 +166,7 @@ class SimulatedDrive:
         return self.wTl(camera_stamp_s + self.config.time_offset_s) * self.truth.cTl.inverse()
 
     def _checked(self, position: int) -> int:
-        if not -len(self) <= position < len(self):
-            raise IndexError(f"frame {position}: the drive has {len(self)}")
-        return position % len(self)
+        return checked_position(position, len(self))
 
     def _scan(
         self, index: int

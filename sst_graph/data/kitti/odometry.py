@@ -77,12 +77,13 @@ class KittiSource(IndexedSource):
         """Frame at a position (read from disk), or the drive restricted to a slice of positions.
 
         Raises:
-            DataError: a file of the frame is truncated, damaged or holds what it must not.
+            DataError: a file of the frame is truncated, damaged or holds what it must not; neither a whole
+                number nor a slice.
             IndexError: no frame at this position.
         """
         if isinstance(position, slice):
-            return replace(self, indices=self.indices[position])
-        index = self.indices[position]
+            return self._part(position)
+        index = self._index(position)
         scan, image = self._scan(index), self._image(index)
         if image is not None:
             image = replace(image, instances=self._instances(index))
@@ -90,11 +91,11 @@ class KittiSource(IndexedSource):
 
     def read_scan(self, position: int) -> Scan | None:
         """Scan of the frame at a position; errors as of the frame."""
-        return self._scan(self.indices[position])
+        return self._scan(self._index(position))
 
     def read_image(self, position: int) -> CameraImage | None:
         """Image of the frame at a position, without instances; errors as of the frame."""
-        return self._image(self.indices[position])
+        return self._image(self._index(position))
 
     def facts(self) -> SourceFacts:
         """Folders and stamps."""

@@ -16,6 +16,7 @@ from sst_graph.errors import ConfigError
 from sst_graph.odometry.sweep.decision import CLAIMS, SweepDecision, decide_sweep
 from sst_graph.sweep_timing import AT_ONCE, SweepStamp, SweepTiming
 from sst_graph.types import Frame, Scan, Source
+from sst_graph.validation import checked_position
 
 SWEEP_KEY = "sweep"
 """Where a result's diagnostics keep what was decided of the sweeps, by name of the drive."""
@@ -33,7 +34,8 @@ class SweptSource(SourceView):
         self._ahead = AheadReader(source) if ahead is None else ahead
 
     def __getitem__(self, position: int) -> Frame:
-        """Frame at a position; IndexError as the source's own."""
+        """Frame at a position; errors as :func:`~sst_graph.validation.checked_position`, and its own."""
+        position = checked_position(position, len(self))
         frame = self._ahead.frame(position)
         return replace(frame, scan=self._timed(frame.scan))
 
