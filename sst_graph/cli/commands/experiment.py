@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import shlex
+from collections.abc import Sequence
 from contextlib import ExitStack
+from pathlib import Path
 
 from sst_graph.cli.inputs import settings
 from sst_graph.cli.messages import mention, say
@@ -61,15 +63,31 @@ def _write_table(table: PaperTable, config: PaperTableConfig, args: argparse.Nam
     paths = table.paths(config, args.out)
     named = {"--out": args.out, **{f"the {path.suffix[1:]} beside it": path for path in paths[1:]}}
     check_apart({"--config": args.config}, {**named, "the file of runs": args.out.parent / STATE})
+    left = _left_by_a_kill(paths)
     with ExitStack() as outputs:
-        files = {path: outputs.enter_context(output_file(path, args.overwrite)) for path in paths}
+        files = {
+            path: outputs.enter_context(output_file(path, args.overwrite))
+            for path in paths
+            if path not in left
+        }
         with ProgressBar() as progress:
             contents = {**table.files(config, progress, args.out)}
         contents[args.out] += _origin(args)
-        for path, text in contents.items():
-            files[path].write_text(text)
+        for path in (*paths[1:], args.out):  # the table last: without it nothing is finished
+            if path not in left:
+                files[path].write_text(contents[path])
+            elif path.read_bytes() != contents[path].encode():
+                outputs.enter_context(output_file(path, args.overwrite)).write_text(contents[path])
     mention(f"{'wrote':<15} {', '.join(str(path) for path in paths)}")
     return 0
+
+
+def _left_by_a_kill(paths: Sequence[Path]) -> list[Path]:
+    """Files beside a table that a run may have written which ended before the table: runs are there, and the
+    table is not. Where they hold what is to be written, they need no ``--overwrite``."""
+    table, *others = paths
+    unfinished = not table.exists() and (table.parent / STATE).is_file()
+    return [path for path in others if unfinished and path.is_file()]
 
 
 def _origin(args: argparse.Namespace) -> str:

@@ -11,12 +11,14 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from sst_graph.cli import main
 from sst_graph.experiments.paper.tables import STATE
 from sst_graph.experiments.tasks.code_version import code_version
+from sst_graph.files.output import OutputFile
 
 PROGRAM = [sys.executable, "-m", "sst_graph", "experiment"]
 DRIVES = Path(__file__).resolve().parents[4] / "shared" / "data"
@@ -64,6 +66,44 @@ def test_a_kitti_root_gives_the_stretch_of_sequence_00(
     assert main([*command, "--overwrite", "--set", "starts=2"]) == 0
     assert (out.parent / STATE).read_bytes().startswith(state)
     assert len((out.parent / STATE).read_bytes().splitlines()) == 2 * len(state.splitlines()) - 1
+
+
+def test_a_kill_among_the_outputs_needs_no_overwrite(
+    kitti: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """After any number of the three files is written, the same command finishes."""
+    command = ["experiment", "table3", "--data", str(kitti), "--methods", "joint", "--out"]
+    assert main([*command, str(tmp_path / "whole/table3.md")]) == 0
+    for written in (0, 1, 2):
+        out, puts = tmp_path / str(written) / "table3.md", []
+        write = OutputFile.write_bytes
+
+        def killed(
+            self: OutputFile, data: bytes, after: int = written, puts: list[int] = puts, write: Any = write
+        ) -> None:
+            if len(puts) == after:
+                raise KeyboardInterrupt
+            puts.append(len(data))
+            write(self, data)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(OutputFile, "write_bytes", killed)
+            assert main([*command, str(out)]) == 130
+        assert len(list(out.parent.glob("table3.*"))) == written and not out.exists()
+        assert main([*command, str(out)]) == 0
+        for ending in ("md", "csv", "svg"):
+            whole = tmp_path / f"whole/table3.{ending}"
+            assert out.with_suffix(f".{ending}").read_bytes() == whole.read_bytes()
+    # what somebody else put there is not replaced
+    out = tmp_path / "whole/table3.md"
+    out.unlink()
+    out.with_suffix(".csv").write_text("mine")
+    capsys.readouterr()
+    assert main([*command, str(out)]) == 2
+    assert "table3.csv: found a file, expected none (or --overwrite)" in capsys.readouterr().err
+    assert out.with_suffix(".csv").read_text() == "mine" and not out.exists()
+    assert main([*command, str(out), "--overwrite"]) == 0
+    assert out.with_suffix(".csv").read_text() != "mine"
 
 
 def test_outputs_stay_apart(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
