@@ -87,15 +87,6 @@ class SensorPath:
         self._covariances = np.array([motion.covariance for motion in motions]).reshape(-1, 6, 6)
         self._matrices = np.array([pose.matrix() for pose in self._poses])
 
-    def at(self, stamp_ns: int) -> tuple[gtsam.Pose3, FloatArray] | None:
-        """Pose in the first stamp's frame, and twist (6,); None where the path does not reach."""
-        stamps = np.array([stamp_ns], np.int64)
-        intervals = self._intervals(stamps)
-        if intervals[0] < 0:
-            return None
-        poses, twists, _ = self._interpolated(intervals, stamps)
-        return gtsam.Pose3(poses[0]), twists[0]
-
     def steps(self, from_ns: NDArray[np.int64], to_ns: NDArray[np.int64]) -> PathSteps:
         """Motions from some times to later ones [ns], (n,) each, where the path reaches."""
         first, last = self._intervals(from_ns), self._intervals(to_ns)

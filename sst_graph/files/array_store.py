@@ -50,11 +50,6 @@ class ArrayStore:
         if (file := getattr(self, "_file", None)) is not None:
             file.close()
 
-    @property
-    def file_bytes(self) -> int:
-        """Bytes that lie in the file."""
-        return self._end
-
     def put(self, array: NDArray[Any], dtype: Any = None) -> Any:
         """Keep an array -> a :class:`StoredArray`, which a field that is :func:`storable` takes for it.
 

@@ -24,7 +24,7 @@ MAKE: dict[str, Callable[[Path, Path], Any]] = {
     "KITTI": lambda drive, folder: open_source(drive),
     "KITTI raw": lambda drive, folder: open_source(as_kitti_raw(drive, folder / "raw")),
     "folder": lambda drive, folder: open_source(as_folder(drive, folder / "street")),
-    "nuScenes": lambda drive, folder: open_source(as_nuscenes(drive, folder / "nus"), sequence="scene-0103"),
+    "nuScenes": lambda drive, folder: open_source(as_nuscenes(drive, folder / "nus"), sequence="scene-0061"),
     "a slice": lambda drive, folder: open_source(drive)[1:],  # type: ignore[index]
     "kept": lambda drive, folder: KeptDrive.of(open_source(drive)),
     "in other axes": lambda drive, folder: LidarFrameSource(open_source(drive), gtsam.Pose3()),

@@ -49,9 +49,9 @@ def evenly(count: int) -> list[int]:
 def test_at_a_stamp_it_is_the_measured_pose() -> None:
     path = SensorPath(motions(weaving, evenly(8)))
     for k in range(8):
-        found = path.at(k * PERIOD_NS)
-        assert found is not None
-        assert found[0].equals(weaving(0.0).between(weaving(0.1 * k)), 1e-9)
+        step = step_of(path, 0, k * PERIOD_NS)
+        assert step is not None
+        assert gtsam.Pose3(step.aTbs[0]).equals(weaving(0.0).between(weaving(0.1 * k)), 1e-9)
 
 
 @pytest.mark.parametrize("jitter", [0, 9_000_000])
@@ -89,9 +89,9 @@ def test_far_from_the_ends_it_follows_closely(
 def test_twists_are_continuous_at_stamps() -> None:
     path = SensorPath(motions(weaving, evenly(12)))
     for k in range(2, 10):
-        before, after = path.at(k * PERIOD_NS - 1000), path.at(k * PERIOD_NS + 1000)
-        assert before is not None and after is not None
-        np.testing.assert_allclose(before[1], after[1], atol=2e-2)
+        step = step_of(path, k * PERIOD_NS - 1000, k * PERIOD_NS + 1000)
+        assert step is not None
+        np.testing.assert_allclose(step.twists_a[0], step.twists_b[0], atol=2e-2)
 
 
 def test_steady_motion_by_hand() -> None:
@@ -106,13 +106,13 @@ def test_steady_motion_by_hand() -> None:
 def test_no_path_beyond_the_ends_or_over_a_failure() -> None:
     found = motions(weaving, evenly(8))
     path = SensorPath(found)
-    assert path.at(-1) is None and step_of(path, 650_000_000, 710_000_000) is None
+    assert step_of(path, -1, 50_000_000) is None and step_of(path, 650_000_000, 710_000_000) is None
     broken = SensorPath([replace(m, ok=k != 3) for k, m in enumerate(found)])
-    assert broken.at(350_000_000) is None
+    assert step_of(broken, 340_000_000, 360_000_000) is None
     assert step_of(broken, 250_000_000, 450_000_000) is None
     assert step_of(broken, 110_000_000, 290_000_000) is not None
     assert step_of(broken, 410_000_000, 690_000_000) is not None
-    assert SensorPath([]).at(0) is None
+    assert step_of(SensorPath([]), 0, 0) is None
 
 
 def test_noise_between_stamps_by_simulation() -> None:
