@@ -226,7 +226,7 @@ def _is_finite(value: Any) -> bool:
 
 def described(value: Any) -> str:
     """A short word on a value of any type, for messages."""
-    if masked_values(value) and np.ndim(value) == 0:  # type: ignore[arg-type]
+    if masked_values(value) and np.ndim(value) == 0:
         return "a masked value"
     if isinstance(value, np.ndarray):
         return f"an array of shape {value.shape}"

@@ -36,7 +36,7 @@ _FIRST_UNKNOWN = int(np.argmin(_IS_CLASS))
 """All smaller numbers are classes."""
 
 
-def checked_position(position: object, count: int, slices: bool = False) -> int:
+def checked_position(position: Any, count: int, slices: bool = False) -> int:
     """Position of one of ``count`` frames, from 0; those below zero count from the end.
 
     Args:
@@ -50,7 +50,7 @@ def checked_position(position: object, count: int, slices: bool = False) -> int:
         raise DataError(
             "position of a frame", described(position), f"a whole number{', or a slice' * slices}"
         )
-    number = int(position)  # type: ignore[call-overload]
+    number: int = int(position)
     if not -count <= number < count:
         raise IndexError(f"frame {described(number)}: the drive has {count}")
     return number % count

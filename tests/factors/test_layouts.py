@@ -99,6 +99,8 @@ SHAPES: dict[str, Callable[[np.ndarray], Any]] = {
 }
 """Other arrays, which are refused or, where they have no more and no fewer numbers, taken for the same."""
 
+pytestmark = pytest.mark.filterwarnings("ignore:the matrix subclass")
+
 
 FIVE = np.linspace(0.8, 1.2, 5)
 TWISTS = np.linspace(0.9, 1.1, 5) * TWIST[:, None]
