@@ -2,12 +2,13 @@
 
 The problem is solved again with the parameters of all assumptions as variables, from matches far away to
 near ones: a wrong assumption moves matches beyond the last kernel, and they are found again where its
-parameter is free. Where few objects are seen, so many parameters and wide kernels may lead to another optimum;
-then it is solved from nearer matches. With those matches frozen one linear step leads to the estimate of one parameter while all
-others hold, with its cluster-robust covariance. The estimate over its deviation decides (Wald). What is
-contradicted most is solved for once more, alone and from where that step leads: that solution must confirm
-it. One that explains less of what is in view than the estimate does is another optimum and says nothing: wide
-kernels lead there where few objects are seen. What is not confirmed leaves the next one to be tried.
+parameter is free. Where few objects are seen, so many parameters and wide kernels may lead to another
+optimum; then it is solved from nearer matches. With those matches frozen one linear step leads to the
+estimate of one parameter while all others hold, with its cluster-robust covariance. The estimate over its
+deviation decides (Wald). What is contradicted most is solved for once more, alone and from where that step
+leads: that solution must confirm it. One that explains less of what is in view than the estimate does is
+another optimum and says nothing: wide kernels lead there where few objects are seen. What is not confirmed
+leaves the next one to be tried.
 """
 
 from __future__ import annotations

@@ -91,9 +91,14 @@ def test_an_optimum_far_away_is_not_considered() -> None:
     be 130 px: that is no deviation to be covered for."""
     street = simulate(
         SimulationConfig(
-            seed=711, frames=6, frame_rate_hz=3.0, width=621, height=187, azimuth_limit_deg=60.0,
+            seed=711,
+            frames=6,
+            frame_rate_hz=3.0,
+            width=621,
+            height=187,
+            azimuth_limit_deg=60.0,
             time_offset_s=0.1,
-        )  # fmt: skip
+        )
     )
     found = calibrate_prepared(prepare_drives([street], CONFIG), street.nominal, CONFIG)
     assert found.diagnostics["assumptions"]["cx"]["sigma"] < 3.0
