@@ -2,11 +2,13 @@
 
 The problem is solved again with the parameters of all assumptions as variables, from matches far away to
 near ones: a wrong assumption moves matches beyond the last kernel, and they are found again where its
-parameter is free. With those matches frozen one linear step leads to the estimate of one parameter while all
-others hold, with its cluster-robust covariance. The estimate over its deviation decides (Wald). What is
-contradicted most is solved for once more, alone and from where that step leads: that solution must confirm
-it. One that explains less of what is in view than the estimate does is another optimum and says nothing: wide
-kernels lead there where few objects are seen. What is not confirmed leaves the next one to be tried.
+parameter is free. Where few objects are seen, so many parameters and wide kernels may lead to another
+optimum; then it is solved from nearer matches. With those matches frozen one linear step leads to the
+estimate of one parameter while all others hold, with its cluster-robust covariance. The estimate over its
+deviation decides (Wald). What is contradicted most is solved for once more, alone and from where that step
+leads: that solution must confirm it. One that explains less of what is in view than the estimate does is
+another optimum and says nothing: wide kernels lead there where few objects are seen. What is not confirmed
+leaves the next one to be tried.
 """
 
 from __future__ import annotations
@@ -47,8 +49,12 @@ _ALL_FREE_KERNELS_PX = (20.0, 10.0, 5.0, 3.0, 3.0, 3.0)
 """Kernel scales of the solution with all parameters free, outer iteration by outer iteration [px]. It need
 not converge: the linear step to one parameter's estimate covers the rest.
 """
-_ONE_FREE_KERNELS_PX = (10.0, 7.0, 5.0, 4.0, 3.0)
-"""Kernel scales of the solution with one parameter free, which starts near its optimum [px]."""
+_NEAR_KERNELS_PX = (10.0, 7.0, 5.0, 4.0, 3.0)
+"""Kernel scales of a solution that starts near its optimum [px]: with one parameter free, or with all where
+the wider kernels lead to another optimum."""
+_ANOTHER_OPTIMUM = 0.9
+"""Share of the boundary points that the estimate explains below which a solution with all parameters free is
+at another optimum. At the same one, more parameters explain 0.99 to 1.02 of them."""
 _MOST_AT_LAST_SCALE = 4
 """Most further outer iterations of the latter at the last scale."""
 
@@ -187,9 +193,12 @@ class LinearProblem:
 
     @classmethod
     def of(cls, problem: SolvedProblem, names: Sequence[str]) -> LinearProblem:
-        """The problem with these parameters free."""
-        start = problem.solution.state.with_parameters(names)
-        solution = problem.solve_with(names, start, _ALL_FREE_KERNELS_PX, len(_ALL_FREE_KERNELS_PX))
+        """The problem with these parameters free.
+
+        Raises:
+            EstimationError: too few matches, or another optimum from near matches, too.
+        """
+        solution = _solved_with_all(problem, names)
         graph, at, pairs = solution.graph, solution.values, solution.pairs
         unknowns = Unknowns.of(solution.state, pairs)
         eliminated = Eliminated.of(graph, at, unknowns)
@@ -243,6 +252,24 @@ class LinearProblem:
         return step, kept, bread
 
 
+def _solved_with_all(problem: SolvedProblem, names: Sequence[str]) -> JointSolution:
+    """The problem with these parameters free, at the estimate's optimum.
+
+    Raises:
+        EstimationError: too few matches, or another optimum from near matches, too.
+    """
+    start = problem.solution.state.with_parameters(names)
+    least = _ANOTHER_OPTIMUM * explained(problem.solution)
+    for kernels_px in (_ALL_FREE_KERNELS_PX, _NEAR_KERNELS_PX):
+        solution = problem.solve_with(names, start, kernels_px, len(kernels_px))
+        if explained(solution) >= least:
+            return solution
+    raise EstimationError(
+        f"parameters of assumptions: found {explained(solution):.3f} of the boundary points explained with "
+        f"all of them free, expected {least:.3f} or more"
+    )
+
+
 def _centred(table: MatchTable, bread: FloatArray) -> MatchTable:
     """Matches with the residuals of a linear fit. After a long step the sum of the scores is not zero, and
     the jackknife over objects would count that as disagreement among the objects."""
@@ -256,7 +283,7 @@ def _solved_alone(
     name = finding.assumption.name
     try:
         solution = problem.solve_with(
-            (name,), start, _ONE_FREE_KERNELS_PX, len(_ONE_FREE_KERNELS_PX) + _MOST_AT_LAST_SCALE
+            (name,), start, _NEAR_KERNELS_PX, len(_NEAR_KERNELS_PX) + _MOST_AT_LAST_SCALE
         )
     except EstimationError as error:
         _LOG.info("assumption %s: %s", name, error)

@@ -20,6 +20,7 @@ from sst_graph.covariance.observability import (
     ObservabilityConfig,
     involves_offset,
     open_directions,
+    reasons_of,
 )
 from sst_graph.covariance.shared_errors import SharedErrors
 from sst_graph.drive.preparation import Drive
@@ -111,7 +112,6 @@ def result_of(
     weak = _weak_directions(estimate, config.observability, advice)
     wrong = (*estimate.reasons, *(_jumps(drives) if config.check_stamps else ()))
     status: Status = "not_converged" if wrong else "unobservable" if estimate.open_sweeps or weak else "ok"
-    sentences = (direction.reason for direction in weak)
     qualities = quality_of(estimate.fit) | quality_of(estimate.edges_fit, EDGES_QUALITY)
     return CalibrationResult(
         T_camera_lidar=estimate.cTl,
@@ -119,7 +119,7 @@ def result_of(
         covariance=estimate.covariance,
         status=status,
         camera=drives[0].camera,
-        reasons=(*wrong, *estimate.open_sweeps, *estimate.assumed, *sentences, *estimate.remarks),
+        reasons=(*wrong, *estimate.open_sweeps, *estimate.assumed, *reasons_of(weak), *estimate.remarks),
         weak_directions=weak,
         frames_used=estimate.frames,
         drive_offsets=estimate.drive_offsets,

@@ -11,8 +11,8 @@ that a part does not determine has a large variance in the difference and so doe
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from itertools import combinations
+from dataclasses import dataclass, field, replace
+from itertools import accumulate, combinations
 
 import gtsam
 import numpy as np
@@ -93,15 +93,31 @@ class Difference:
         Args:
             own_offsets: each part has a time offset of its own: only the extrinsics are compared.
         """
-        n, names = 6 if own_offsets else 7, _names(*others, one)
-        mean, covariance, _ = _joint(others, names)
+        names, around = _names(*others, one), combined(others).step
+        sums = _Sums.joined([_Sums.of(each, around, names) for each in others])
+        return cls._from_sums(sums, one, own_offsets)
+
+    @classmethod
+    def each_from_others(cls, parts: Sequence[PartEstimate]) -> list[Difference]:
+        """:meth:`from_others` of every part: their equations are summed once from either end, not anew for
+        each."""
+        names, around = _names(*parts), combined(parts).step
+        own = [_Sums.of(each, around, names) for each in parts]
+        before, after = (list(accumulate(each)) for each in (own, reversed(own)))
+        others = (_Sums.joined([*before[:k][-1:], *after[: len(own) - k - 1][-1:]]) for k in range(len(own)))
+        return [cls._from_sums(sums, one, False) for sums, one in zip(others, parts, strict=True)]
+
+    @classmethod
+    def _from_sums(cls, others: _Sums, one: PartEstimate, own_offsets: bool) -> Difference:
+        n, names = 6 if own_offsets else 7, others.names
+        mean, covariance, _ = others.solved()
         J = _design(one, names)[:n]
         step, covariance = one.step[:n] - J @ mean, one.covariance[:n, :n] + J @ covariance @ J.T
         along = np.linalg.solve(covariance, step)
         total = max(float(along @ covariance @ along), 1e-300)
         freedom = sum(
-            (float(along @ side.covariance[:n, :n] @ along) / total) ** 2 / max(side.clusters - 1.0, 1.0)
-            for side in (combined(others), one)
+            (float(along @ each[:n, :n] @ along) / total) ** 2 / max(clusters - 1.0, 1.0)
+            for each, clusters in ((others.own_covariance, others.clusters), (one.covariance, one.clusters))
         )
         return cls(step, covariance, max(1.0 / freedom, _LEAST_FREEDOM) if freedom > 0.0 else np.inf)
 
@@ -148,22 +164,62 @@ def disagreement(estimates: Sequence[PartEstimate]) -> float:
 
     The least over x and a of sum (d_k - x - S_k a)' L_k (d_k - x - S_k a) + a' a.
     """
-    return _joint(estimates, _names(*estimates))[2]
+    names, around = _names(*estimates), combined(estimates).step
+    return _Sums.joined([_Sums.of(each, around, names) for each in estimates]).solved()[2]
 
 
-def _joint(estimates: Sequence[PartEstimate], names: Sequence[str]) -> tuple[FloatArray, FloatArray, float]:
-    """Mean (7 + c,) and covariance of x and the common errors of some names, and the least cost; an error
-    that no estimate has keeps its one deviation."""
-    around = combined(estimates).step
-    H = np.diag([0.0] * 7 + [1.0] * len(names))
-    g, constant = np.zeros(len(H)), 0.0
-    for each in estimates:
-        J, d, L = _design(each, names), each.step - around, np.linalg.inv(each.covariance)
-        H, g, constant = H + J.T @ L @ J, g + J.T @ L @ d, constant + float(d @ L @ d)
-    covariance = scaled_inverse(H)
-    least = covariance @ g
-    mean = least + np.concatenate([around, np.zeros(len(names))])
-    return mean, covariance, constant - float(g @ least)
+@dataclass(frozen=True)
+class _Sums:
+    """Normal equations of x and the common errors a by the estimates of parts.
+
+    Attributes:
+        around: (7,) the step about which they are written.
+        names: of the common errors.
+        H, g, constant: (7 + c, 7 + c), (7 + c,) and number of the squared length of d_k - x - S_k a, without
+            a' a.
+        clusters: of all parts.
+    """
+
+    around: FloatArray
+    names: Sequence[str]
+    H: FloatArray
+    g: FloatArray
+    constant: float
+    clusters: float
+
+    @classmethod
+    def of(cls, part: PartEstimate, around: FloatArray, names: Sequence[str]) -> _Sums:
+        """Of one part."""
+        J, d, L = _design(part, names), part.step - around, np.linalg.inv(part.covariance)
+        return cls(around, names, J.T @ L @ J, J.T @ L @ d, float(d @ L @ d), part.clusters)
+
+    def __add__(self, other: _Sums) -> _Sums:
+        return replace(
+            self,
+            H=self.H + other.H,
+            g=self.g + other.g,
+            constant=self.constant + other.constant,
+            clusters=self.clusters + other.clusters,
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence[_Sums]) -> _Sums:
+        """Of several, about one step."""
+        return sum(parts[1:], parts[0])
+
+    @property
+    def own_covariance(self) -> FloatArray:
+        """(7, 7) of x where the common errors are zero."""
+        return np.asarray(np.linalg.inv(self.H[:7, :7]))
+
+    def solved(self) -> tuple[FloatArray, FloatArray, float]:
+        """Mean (7 + c,) and covariance of x and the common errors, and the least cost; an error that no
+        estimate has keeps its one deviation."""
+        count = len(self.names)
+        covariance = scaled_inverse(self.H + np.diag([0.0] * 7 + [1.0] * count))
+        least = covariance @ self.g
+        mean = least + np.concatenate([self.around, np.zeros(count)])
+        return mean, covariance, self.constant - float(self.g @ least)
 
 
 def _design(estimate: PartEstimate, names: Sequence[str]) -> FloatArray:

@@ -65,8 +65,9 @@ class ImageShifts:
         found = []
         if of_stamp:
             found.append(
-                f"the stamps of the images jitter by {1e3 * late_s:.1f} ms (one sigma): stamp them by their "
-                "trigger or exposure, not by their arrival; it is in the sigmas"
+                f"the stamps of the images jitter by {1e3 * late_s:.1f} ms (one sigma), or scans too far "
+                "apart in time leave the motion between them open: stamp images by their trigger or "
+                "exposure, not by their arrival, and scan at 10 Hz or more; it is in the sigmas"
             )
         if of_picture:
             found.append(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -157,6 +158,11 @@ def inseparable_directions(
         for direction in weak_directions(covariance, cTl, config)
         if min(abs(float(direction.vector[6])), float(np.linalg.norm(direction.vector[3:6]))) > _TAKES_PART
     )
+
+
+def reasons_of(directions: Sequence[WeakDirection]) -> tuple[str, ...]:
+    """The reason of each direction; what two of them say alike, once."""
+    return tuple(dict.fromkeys(direction.reason for direction in directions))
 
 
 def involves_offset(direction: WeakDirection) -> bool:

@@ -48,9 +48,7 @@ def check_agreement(
     # 1. All together: how much the costs are above their own minima, for 7 numbers a part more than needed.
     chi2, freedom = disagreement(estimates), 7 * (len(parts) - 1)
     # 2. Each against the others: what it adds to all of that.
-    against = [
-        Difference.from_others([*estimates[:k], *estimates[k + 1 :]], one) for k, one in enumerate(estimates)
-    ]
+    against = Difference.each_from_others(estimates)
     worst = int(np.argmax([difference.chi2 for difference in against]))
     p_value = min(float(chdtrc(freedom, chi2)), len(parts) * against[worst].p_value)
     if 2.0 * p_value < significance:

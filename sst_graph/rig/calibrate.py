@@ -24,7 +24,7 @@ from sst_graph.batch.method_estimate import UNKNOWN_SIGMAS, MethodEstimate, qual
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.batch.sources import as_sources
 from sst_graph.config import expect_settings, to_dict
-from sst_graph.covariance.observability import open_directions
+from sst_graph.covariance.observability import open_directions, reasons_of
 from sst_graph.covariance.shared_errors import SharedErrors
 from sst_graph.drive.further_camera import with_camera
 from sst_graph.drive.preparation import Drive, Progress, check_progress
@@ -460,7 +460,7 @@ def _camera_result(
     kept = tuple(reason for reason in own.reasons if reason not in gone)
     if not own.frames_used and status == "ok":
         kept = (_FROM_OTHERS, *kept)
-    sentences = (*camera.open_sweeps, *(direction.reason for direction in weak))
+    sentences = (*camera.open_sweeps, *reasons_of(weak))
     alone = {
         "T_camera_lidar": own.T_camera_lidar.matrix().tolist(),
         "time_offset_s": own.time_offset_s,

@@ -86,6 +86,26 @@ def test_another_optimum_contradicts_nothing(seed: int) -> None:
 
 
 @pytest.mark.slow
+def test_an_optimum_far_away_is_not_considered() -> None:
+    """With every parameter free, wide kernels lead to another pose from these six frames, at which cx would
+    be 130 px: that is no deviation to be covered for."""
+    street = simulate(
+        SimulationConfig(
+            seed=711,
+            frames=6,
+            frame_rate_hz=3.0,
+            width=621,
+            height=187,
+            azimuth_limit_deg=60.0,
+            time_offset_s=0.1,
+        )
+    )
+    found = calibrate_prepared(prepare_drives([street], CONFIG), street.nominal, CONFIG)
+    assert found.diagnostics["assumptions"]["cx"]["sigma"] < 3.0
+    assert np.sqrt(found.covariance[2, 2]) < np.radians(0.5)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("k1", [-0.1])
 def test_a_distorted_picture_is_named_and_can_be_estimated(k1: float) -> None:
     distorted = prepared(k1)

@@ -85,6 +85,22 @@ def test_what_shifts_both_parts_alike_hides_no_step() -> None:
     assert Difference.of(part(step), one).chi2 == pytest.approx(64.0 / 2502.0)
 
 
+def test_each_against_the_others_in_one_go() -> None:
+    rng = np.random.default_rng(8)
+    parts = [
+        replace(
+            part(SIGMAS * rng.normal(size=7), clusters=float(rng.uniform(5.0, 30.0))),
+            common={name: SIGMAS * rng.normal(size=7) for name in ("cx", "cy")[: k % 3]},
+        )
+        for k in range(7)
+    ]
+    for k, found in enumerate(Difference.each_from_others(parts)):
+        expected = Difference.from_others([*parts[:k], *parts[k + 1 :]], parts[k])
+        np.testing.assert_allclose(found.step, expected.step, rtol=1e-9, atol=1e-15)
+        np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-9, atol=1e-18)
+        assert found.freedom == pytest.approx(expected.freedom)
+
+
 def test_what_combined_parts_have_in_common_is_weighted_as_they_are() -> None:
     one = replace(part(np.zeros(7)), common={"cx": np.full(7, 1.0), "k1": np.full(7, 1.0)})
     other = replace(part(np.zeros(7), SIGMAS / 2.0), common={"cx": np.full(7, 6.0), "k1": np.full(7, 6.0)})

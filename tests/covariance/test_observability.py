@@ -13,6 +13,7 @@ from sst_graph.covariance.observability import (
     SILHOUETTES,
     ObservabilityConfig,
     inseparable_directions,
+    reasons_of,
     weak_directions,
     worst_ratio,
 )
@@ -185,6 +186,11 @@ def test_the_weakest_first_and_only_past_the_limits() -> None:
     assert [int(np.abs(weak.vector).argmax()) for weak in found] == [3, 2]
     wide = ObservabilityConfig(rotation_deg=2.0, translation_m=0.5, time_offset_s=0.01)
     assert weak_directions(np.diag(sigmas**2), CTL, wide) == ()
+
+
+def test_what_two_directions_say_alike_is_said_once() -> None:
+    found = weak_directions(with_direction(np.array([0.0, 0.02, 0.0, 0.3, 0.0, 0.0, 0.0])), CTL, CONFIG)
+    assert found and reasons_of((*found, *found)) == tuple(weak.reason for weak in found)
 
 
 @pytest.mark.parametrize("remedy", [*astuple(SILHOUETTES), *astuple(MOTION)])

@@ -394,8 +394,7 @@ def _best_start(window: SweepWindow) -> tuple[float, int]:
     """The share of the sweep, and the sector at whose border a turn begins, under which scans meet best.
 
     Points between the right start and another are off by a whole turn and match nothing, so that the cost has
-    no
-    gradient there: starts are tried in a grid, which is refined around the best.
+    no gradient there: starts are tried in a grid, which is refined around the best.
     """
 
     def misfit(fraction: float, sector: int) -> float:
