@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sst_graph.drive.preparation import Drive, ScanFeatures
 from sst_graph.features.lidar_edges import Edge, with_points
+from sst_graph.files.array_store import replaced
 from sst_graph.objects.tracks import ObjectId, numbers_in, of_each
 from sst_graph.sampling import step_for
 from sst_graph.types import SemanticClass
@@ -26,7 +27,7 @@ def thinned_scan(scan: ScanFeatures, most: int, classes: Collection[SemanticClas
         c: points.take(np.arange(0, len(points), step_for(len(points), most))) if c in classes else points
         for c, points in scan.boundaries.items()
     }
-    return replace(scan, boundaries=boundaries)
+    return replaced(scan, boundaries=boundaries)
 
 
 def with_objects(drive: Drive, tracks: Mapping[ObjectId, int], kept: NDArray[np.bool_]) -> Drive:
@@ -37,7 +38,7 @@ def with_objects(drive: Drive, tracks: Mapping[ObjectId, int], kept: NDArray[np.
         for c, points in scan.boundaries.items():
             numbers = {n: tracks[position, c, n] for n in numbers_in(points.objects)}
             boundaries[c] = points.take(np.flatnonzero(kept[of_each(points.objects, numbers) % len(kept)]))
-        scans.append(replace(scan, boundaries=with_points(boundaries)))
+        scans.append(replaced(scan, boundaries=with_points(boundaries)))
     return replace(drive, scans=tuple(scans))
 
 
@@ -46,5 +47,5 @@ def without_kind(drive: Drive, kind: Edge) -> Drive:
     scans = []
     for scan in drive.scans:
         kept = {c: points.take(np.flatnonzero(points.edges != kind)) for c, points in scan.boundaries.items()}
-        scans.append(replace(scan, boundaries=with_points(kept)))
+        scans.append(replaced(scan, boundaries=with_points(kept)))
     return replace(drive, scans=tuple(scans))
