@@ -18,9 +18,9 @@ from pathlib import Path
 from sst_graph.simulator import SimulationConfig, simulate, write_drive
 
 
-def peak_mb(drive: Path, frames: int, out: Path) -> float:
+def peak_mb(drive: Path, frames: int, method: str, out: Path) -> float:
     """Largest resident memory [MB] of a calibration of the first frames."""
-    arguments = ["calibrate", str(drive), "--frames", f"0:{frames}", "--out", str(out)]
+    arguments = ["calibrate", str(drive), "--frames", f"0:{frames}", "--method", method, "--out", str(out)]
     process = subprocess.Popen(
         [sys.executable, "-m", "sst_graph", *arguments],
         stdout=subprocess.DEVNULL,
@@ -39,6 +39,7 @@ def main() -> None:
     )
     parser.add_argument("data", nargs="?", type=Path)
     parser.add_argument("--frames", nargs="+", type=int, default=[60, 400])
+    parser.add_argument("--method", default="auto")
     parser.add_argument("--seed", type=int, default=5)
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
@@ -49,7 +50,7 @@ def main() -> None:
             write_drive(simulate(config), drive)
         first = None
         for frames in args.frames:
-            peak = peak_mb(drive, frames, Path(folder) / f"out{frames}")
+            peak = peak_mb(drive, frames, args.method, Path(folder) / f"out{frames}")
             first = peak if first is None else first
             print(f"{frames} frames: {peak:.0f} MB, {peak / first:.2f} times the first", flush=True)
 

@@ -24,7 +24,7 @@ from sst_graph.drive.preparation import (
     image_features,
 )
 from sst_graph.errors import DataError, count_of
-from sst_graph.files.array_store import ArrayStore
+from sst_graph.files.array_store import ArrayStore, replaced
 from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.sweep import SweptSource
 from sst_graph.odometry.visual import ImagePair, next_pair
@@ -51,7 +51,7 @@ def with_camera(
     images, pairs, left_out, seen = _images(source, classes, config, progress)
     if not images:
         raise DataError(source.name, f"no image in {count_of(len(source), 'frame')}", "scans and images")
-    scans = tuple(replace(scan, index=number) for scan, number in zip(drive.scans, numbers, strict=True))
+    scans = tuple(replaced(scan, index=number) for scan, number in zip(drive.scans, numbers, strict=True))
     for_scans = drive.left_out
     left_out = replace(
         left_out,

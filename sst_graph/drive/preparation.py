@@ -21,7 +21,7 @@ from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.lidar_edges import MAX_RANGE_M, Boundaries, Edge, find_boundaries, with_points
 from sst_graph.features.mask_contour import ContourMap
 from sst_graph.features.picture_gradients import PictureGradients
-from sst_graph.files.array_store import IN_MEMORY_BYTES, ArrayStore, storable
+from sst_graph.files.array_store import IN_MEMORY_BYTES, ArrayStore, replaced, storable
 from sst_graph.files.object_store import PackedArray
 from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
@@ -112,9 +112,15 @@ class ScanFeatures:
     by_geometry: ScanFeatures | None = None
 
     def stored_in(self, store: ArrayStore) -> ScanFeatures:
-        """The same with its points in an array store, in the precision of the scan's."""
+        """The same with its points in an array store, the sample in the precision of the scan's."""
+        boundaries, lower_edges = (
+            {c: points.stored_in(store) for c, points in found.items()}
+            for found in (self.boundaries, self.lower_edges)
+        )
         return replace(
             self,
+            boundaries=boundaries,
+            lower_edges=lower_edges,
             lPs=store.put(self.lPs.astype(np.float32), np.float64),
             classes=store.put(self.classes),
             offsets_s=store.put(self.offsets_s.astype(np.float32), np.float64),
@@ -146,8 +152,8 @@ class ImageFeatures:
         return replace(self, mask=store.put(self.mask), contours=contours)
 
     def with_contours(self, contours: dict[SemanticClass, ContourMap | PictureGradients]) -> ImageFeatures:
-        """The image with other contours; its mask as it is kept, not read from the store."""
-        return ImageFeatures(self.index, self.stamp_ns, vars(self)["mask"], contours)
+        """The image with other contours."""
+        return replaced(self, contours=contours)
 
     def __getstate__(self) -> dict[str, Any]:
         """The mask, packed, and the picture's edges, not the distances that follow from them."""

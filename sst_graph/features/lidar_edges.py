@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from sst_graph.features.lidar_beams import Beams, arrange_beams
 from sst_graph.features.up import up_direction
+from sst_graph.files.array_store import ArrayStore, shape_of, storable
 from sst_graph.types import FloatArray, IntArray, Scan, SemanticClass
 
 _BEHIND_M = 0.5
@@ -65,6 +67,7 @@ class Edge(IntEnum):
     the outline may lie higher."""
 
 
+@storable("lPs", "outward", "rings", "offsets_s", "edges", "objects")
 @dataclass(frozen=True)
 class Boundaries:
     """Boundary points of one class in one scan.
@@ -87,7 +90,11 @@ class Boundaries:
     objects: IntArray
 
     def __len__(self) -> int:
-        return len(self.lPs)
+        return shape_of(self, "lPs")[0]
+
+    def stored_in(self, store: ArrayStore) -> Boundaries:
+        """The same with its points in an array store."""
+        return Boundaries(*map(store.put, self._rows()))
 
     def joined(self, other: Boundaries) -> Boundaries:
         """These points and others of the same scan."""
@@ -96,7 +103,11 @@ class Boundaries:
     def take(self, index: IntArray) -> Boundaries:
         """Some of the points, by position."""
         # Much faster than by an index.
-        return Boundaries(*(rows.take(index, axis=0) for rows in vars(self).values()))
+        return Boundaries(*(rows.take(index, axis=0) for rows in self._rows()))
+
+    def _rows(self) -> tuple[NDArray[Any], ...]:
+        """All attributes, in their order."""
+        return self.lPs, self.outward, self.rings, self.offsets_s, self.edges, self.objects
 
 
 def with_points(found: Mapping[SemanticClass, Boundaries]) -> dict[SemanticClass, Boundaries]:

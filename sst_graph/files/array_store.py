@@ -14,9 +14,9 @@ import os
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from io import FileIO
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -158,6 +158,12 @@ def shape_of(instance: object, name: str) -> tuple[int, ...]:
     """Shape of the array in a field that is :func:`storable`; nothing is read."""
     shape: tuple[int, ...] = vars(instance)[name].shape
     return shape
+
+
+def replaced(instance: _T, **changes: Any) -> _T:
+    """As :func:`dataclasses.replace`, with the other fields as they are kept: nothing is read."""
+    kept = {field.name: vars(instance)[field.name] for field in fields(cast(Any, instance)) if field.init}
+    return type(instance)(**{**kept, **changes})
 
 
 def storable(*names: str) -> Callable[[type[_T]], type[_T]]:

@@ -185,15 +185,19 @@ class DriveEdges:
         if not groups:
             return None
         parts = [points for _, _, points in groups]
-        own = None
+        objects, own = [points.objects for points in parts], None
         if (known := motion.objects) is not None:
             own = np.concatenate(
                 [
-                    of_each(points.objects, {n: known[k, c, n] for n in numbers_in(points.objects)})
-                    for k, c, points in groups
+                    of_each(numbers, {n: known[k, c, n] for n in numbers_in(numbers)})
+                    for (k, c, _), numbers in zip(groups, objects, strict=True)
                 ]
             )
-        unknown_mps, velocities = _own_motion([(motion.dynamic_objects(k), c, b) for k, c, b in groups])
+        dynamic = [
+            (motion.dynamic_objects(k), c, numbers)
+            for (k, c, _), numbers in zip(groups, objects, strict=True)
+        ]
+        unknown_mps, velocities = _own_motion(dynamic)
         return cls(
             number,
             drive,
@@ -202,7 +206,7 @@ class DriveEdges:
             tuple(k for k, _, _ in groups),
             tuple(c for _, c, _ in groups),
             joined(parts),
-            numbered_through([points.objects for points in parts]),
+            numbered_through(objects),
             np.cumsum([0, *map(len, parts)]),
             own,
             unknown_mps,
@@ -557,16 +561,20 @@ class DriveMatches:
 
 
 def _own_motion(
-    groups: Sequence[tuple[DynamicObjects, SemanticClass, Boundaries]],
+    groups: Sequence[tuple[DynamicObjects, SemanticClass, IntArray]],
 ) -> tuple[FloatArray | None, FloatArray | None]:
     """Unknown speed of each point's object (n,) [m/s], and its velocity (n, 3) [m/s]; None where no object
-    moves."""
-    unknown = [np.zeros(len(points)) for _, _, points in groups]
-    velocities = [np.zeros((len(points), 3)) for _, _, points in groups]
-    for (dynamic, c, points), slow, known in zip(groups, unknown, velocities, strict=True):
+    moves.
+
+    Args:
+        groups: the dynamic objects of each group's scan, its class, and the object of each of its points.
+    """
+    unknown = [np.zeros(len(objects)) for _, _, objects in groups]
+    velocities = [np.zeros((len(objects), 3)) for _, _, objects in groups]
+    for (dynamic, c, objects), slow, known in zip(groups, unknown, velocities, strict=True):
         for (other, n), one in dynamic.items():
             if other == c:
-                own = points.objects == n
+                own = objects == n
                 slow[own] = one.unknown_mps
                 if one.velocity is not None:
                     known[own] = one.velocity.l_velocity

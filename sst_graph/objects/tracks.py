@@ -72,9 +72,9 @@ def object_centres(
     """(3,) mean of each object's boundary points in the world [m], of a scan posed at ``wTl``."""
     centres: dict[ObjectName, FloatArray] = {}
     for c, points in boundaries.items():
-        numbers, which = np.unique(points.objects, return_inverse=True)
+        lPs, (numbers, which) = points.lPs, np.unique(points.objects, return_inverse=True)
         for k, number in enumerate(numbers):
-            centres[c, int(number)] = wTl.transformFrom(points.lPs[which == k].mean(axis=0))
+            centres[c, int(number)] = wTl.transformFrom(lPs[which == k].mean(axis=0))
     return centres
 
 

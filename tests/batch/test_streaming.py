@@ -7,9 +7,9 @@ import os
 import sys
 import tracemalloc
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,13 +19,16 @@ from streets import SHORT_STREET, standing_street
 
 from sst_graph import open_source
 from sst_graph.batch import CalibrationConfig, prepare_drives
+from sst_graph.batch.by_edges.parts import thinned
 from sst_graph.cli.outputs import write_calibration
 from sst_graph.drive.preparation import Drive, prepare_drive
 from sst_graph.factors.camera import PinholeCamera
+from sst_graph.features.lidar_edges import Boundaries
 from sst_graph.result import CalibrationResult, FrameId
 from sst_graph.types import Frame, SemanticClass
 
-VEHICLE = SemanticClass.VEHICLE
+VEHICLE, OBJECT = SemanticClass.VEHICLE, SemanticClass.OBJECT
+LABELLED, UNLABELLED = CalibrationConfig().classes, (OBJECT,)
 
 
 class Long:
@@ -56,17 +59,17 @@ class Long:
         return (self[position] for position in range(self.count))
 
 
-def prepared(frames: int, in_memory_bytes: int) -> Drive:
+def prepared(frames: int, in_memory_bytes: int, classes: Sequence[SemanticClass] = LABELLED) -> Drive:
     """The drive with so much of it in memory."""
     config = replace(CalibrationConfig().prepare, use_visual_odometry=False, in_memory_bytes=in_memory_bytes)
-    return prepare_drive(Long(frames), CalibrationConfig().classes, config, depth=False)
+    return prepare_drive(Long(frames), classes, config, depth=False)
 
 
-def traced(frames: int) -> tuple[int, int, Drive]:
+def traced(frames: int, classes: Sequence[SemanticClass]) -> tuple[int, int, Drive]:
     """Bytes that preparing so many frames leaves behind, and their peak on the way."""
     gc.collect()
     tracemalloc.start()
-    drive = prepared(frames, in_memory_bytes=1_000_000)
+    drive = prepared(frames, 1_000_000, classes)
     gc.collect()
     kept, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
@@ -75,16 +78,39 @@ def traced(frames: int) -> tuple[int, int, Drive]:
 
 def test_little_of_a_frame_stays_in_memory() -> None:
     """Its fields alone take 0.5 MB at half the usual size, its labelled points and mask as much."""
-    few, few_peak, _ = traced(6)
-    many, many_peak, drive = traced(18)
+    few, few_peak, _ = traced(6, LABELLED)
+    many, many_peak, drive = traced(18, LABELLED)
     fields = sum(contour.distance.nbytes for image in drive.images for contour in image.contours.values())
     assert fields > 18 * 300_000
     assert (many - few) / 12 < 100_000
     assert (many_peak - few_peak) / 12 < 100_000
 
 
+def test_little_of_a_frame_by_edges_stays_in_memory() -> None:
+    """Its boundary points alone take 0.3 MB."""
+    few, few_peak, _ = traced(6, UNLABELLED)
+    many, many_peak, drive = traced(18, UNLABELLED)
+    assert sum(len(scan.boundaries[OBJECT]) for scan in drive.scans) > 18 * 4_000
+    assert (many - few) / 12 < 100_000
+    assert (many_peak - few_peak) / 12 < 100_000
+
+
+def test_a_drive_with_fewer_boundary_points_has_its_other_arrays_on_disk() -> None:
+    drive = prepared(6, 0, UNLABELLED)
+    gc.collect()
+    tracemalloc.start()
+    few = thinned(drive, 100)
+    gc.collect()
+    in_memory, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    points = sum(len(scan.boundaries[OBJECT]) for scan in few.scans)
+    assert 0 < points <= 6 * 100
+    assert sum(scan.lPs.nbytes for scan in few.scans) > 6 * 50_000
+    assert in_memory < 100 * points + 6 * 5_000
+
+
 def test_a_drive_in_the_array_store_is_the_same_drive() -> None:
-    plain, stored = prepared(2, in_memory_bytes=100_000_000), prepared(2, in_memory_bytes=0)
+    plain, stored = prepared(2, 100_000_000), prepared(2, 0)
     for a, b in zip(plain.scans, stored.scans, strict=True):
         assert len(a.lPs) > 100 and a.lPs.dtype == b.lPs.dtype == float
         assert (a.lPs == b.lPs).all() and (a.classes == b.classes).all()
@@ -93,6 +119,20 @@ def test_a_drive_in_the_array_store_is_the_same_drive() -> None:
         assert (c.mask == d.mask).all() and list(c.contours) == list(d.contours) == [VEHICLE]
         assert (c.contours[VEHICLE].distance == d.contours[VEHICLE].distance).all()
         assert (c.contours[VEHICLE].unknown == d.contours[VEHICLE].unknown).all()
+
+
+@pytest.mark.parametrize("classes", [LABELLED, UNLABELLED])
+def test_boundary_points_in_the_array_store_are_the_same(classes: Sequence[SemanticClass]) -> None:
+    plain, stored = prepared(2, 100_000_000, classes), prepared(2, 0, classes)
+    for a, b in zip(plain.scans, stored.scans, strict=True):
+        for found, there in ((a.boundaries, b.boundaries), (a.lower_edges, b.lower_edges)):
+            assert list(found) == list(there)
+            for c in found:
+                assert len(found[c]) == len(there[c]) > 0
+                for field in fields(Boundaries):
+                    rows, others = (getattr(each[c], field.name) for each in (found, there))
+                    assert rows.dtype == others.dtype and (rows == others).all()
+        assert a.boundaries
 
 
 _opened: Counter[str] | None = None

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sst_graph.files.array_store import ArrayStore, StoredArray, shape_of, storable
+from sst_graph.files.array_store import ArrayStore, StoredArray, replaced, shape_of, storable
 
 
 @storable("values")
@@ -76,6 +76,17 @@ def test_a_field_answers_the_array() -> None:
     np.testing.assert_array_equal(replace(stored, name="b").values, values)
     with pytest.raises(AttributeError):  # frozen as before
         stored.values = values  # type: ignore[misc]
+
+
+def test_other_fields_are_replaced_without_reading() -> None:
+    store = ArrayStore(0)
+    holder = Holder("a", store.put(np.arange(6, dtype=np.float32)))
+    other = replaced(holder, name="b")
+    assert (other.name, vars(other)["values"]) == ("b", vars(holder)["values"])
+    store.__del__()  # closes the file: what is read now fails
+    assert replaced(other, values=np.ones(2, np.float32)).values.tolist() == [1.0, 1.0]
+    with pytest.raises(ValueError):
+        _ = replaced(other, name="c").values
 
 
 def test_copies_do_not_depend_on_the_file() -> None:

@@ -14,6 +14,8 @@ import numpy as np
 
 from sst_graph.batch.by_edges.covariance import SAMPLES
 from sst_graph.batch.by_edges.optimum import SCORE_PX, START_KERNELS_PX
+from sst_graph.batch.by_edges.parts import thinned
+from sst_graph.batch.by_edges.problem import POINTS_A_SCAN
 from sst_graph.batch.by_edges.reasons import MIN_OVER_OTHER
 from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX
 from sst_graph.batch.contradictions import FALSE_ALARM
@@ -42,6 +44,7 @@ def halves_reasons(problem: JointProblem, state: State, covariance: FloatArray) 
     """A sentence for every drive whose halves contradict each other.
 
     Args:
+        problem: with all boundary points.
         state: estimate of all drives together.
         covariance: (7, 7) of it.
     """
@@ -70,7 +73,8 @@ def _half(
     """A half's own estimate, as a step from that of the whole; None where it has none."""
     if len(scans) < _LEAST_SCANS:
         return None
-    drive, motion = problem.drives[number].part(scans), problem.motions[number].part(scans)
+    drive = thinned(problem.drives[number].part(scans), POINTS_A_SCAN)
+    motion = problem.motions[number].part(scans)
     few = evenly_spread(range(len(scans)), _SEARCHED_SCANS)
     some = replace(problem, drives=[drive.part(few)], motions=[motion.part(few)])
     edges = edges_of(some.drives, some.motions, problem.config.graph)

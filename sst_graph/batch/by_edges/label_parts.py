@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from sst_graph.drive.preparation import Drive, ScanFeatures
+from sst_graph.files.array_store import replaced
 from sst_graph.types import SemanticClass
 
 
@@ -55,8 +57,7 @@ def _of_kind(drive: Drive, by_edges: bool) -> Drive:
 def _by_labels(scan: ScanFeatures) -> ScanFeatures:
     """The labelled objects; a scan without labels keeps points, among them the outlines of its objects, for
     they show which labelled objects of the scans around it stand."""
-    # The fields as they are kept, not read from the store.
-    kept = {**vars(scan), "boundaries": scan.boundaries, "by_geometry": None}
+    kept: dict[str, Any] = {"by_geometry": None}
     if SemanticClass.OBJECT in scan.boundaries:
         points = scan.boundaries[SemanticClass.OBJECT]
         kept["boundaries"] = {}
@@ -64,4 +65,4 @@ def _by_labels(scan: ScanFeatures) -> ScanFeatures:
         kept["offsets_s"] = np.concatenate([scan.offsets_s, points.offsets_s])
         of_objects = np.full(len(points), SemanticClass.OBJECT, np.uint8)
         kept["classes"] = np.concatenate([scan.classes, of_objects])
-    return ScanFeatures(**kept)
+    return replaced(scan, **kept)

@@ -80,7 +80,8 @@ def edges_method(
     reasons = edges_reasons(solution, contrast, checking, covariance, problem.centre)
     reasons += unsettled
     if config.check_contradictions:
-        reasons += halves_reasons(problem.whole, solution.state, covariance)
+        all_points = replace(problem.whole, drives=calibration.drives)
+        reasons += halves_reasons(all_points, solution.state, covariance)
     # 6. How it fits the pictures, point by point.
     first = [one for _, one in candidates[:1]]
     matched = replace(calibration, drives=problem.whole.drives)

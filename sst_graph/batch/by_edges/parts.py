@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.drive.preparation import Drive, ScanFeatures
+from sst_graph.drive.preparation import Drive, ScanFeatures, boundary_count
 from sst_graph.features.lidar_edges import Edge, with_points
+from sst_graph.files.array_store import replaced
 from sst_graph.objects.tracks import ObjectId, numbers_in, of_each
-from sst_graph.sampling import step_for
+from sst_graph.sampling import spread_places, step_for
 from sst_graph.types import SemanticClass
 
 
@@ -26,7 +27,31 @@ def thinned_scan(scan: ScanFeatures, most: int, classes: Collection[SemanticClas
         c: points.take(np.arange(0, len(points), step_for(len(points), most))) if c in classes else points
         for c, points in scan.boundaries.items()
     }
-    return replace(scan, boundaries=boundaries)
+    return replaced(scan, boundaries=boundaries)
+
+
+def thinned_together(drives: Sequence[Drive], most: int) -> list[Drive]:
+    """The drives with at most so many boundary points in all, evenly spread over each."""
+    counts = [sum(boundary_count(scan, ()) for scan in drive.scans) for drive in drives]
+    if sum(counts) <= most:
+        return list(drives)
+    return [
+        _spread(drive, spread_places(np.arange(count), max(1, most * count // sum(counts))))
+        for drive, count in zip(drives, counts, strict=True)
+    ]
+
+
+def _spread(drive: Drive, kept: NDArray[np.intp]) -> Drive:
+    """The drive with some of its boundary points, by their rising places among those of all scans."""
+    scans, first = [], 0
+    for scan in drive.scans:
+        boundaries = {}
+        for c, points in scan.boundaries.items():
+            here, end = np.searchsorted(kept, (first, first + len(points)))
+            boundaries[c] = points.take(kept[here:end] - first)
+            first += len(points)
+        scans.append(replaced(scan, boundaries=with_points(boundaries)))
+    return replace(drive, scans=tuple(scans))
 
 
 def with_objects(drive: Drive, tracks: Mapping[ObjectId, int], kept: NDArray[np.bool_]) -> Drive:
@@ -37,7 +62,7 @@ def with_objects(drive: Drive, tracks: Mapping[ObjectId, int], kept: NDArray[np.
         for c, points in scan.boundaries.items():
             numbers = {n: tracks[position, c, n] for n in numbers_in(points.objects)}
             boundaries[c] = points.take(np.flatnonzero(kept[of_each(points.objects, numbers) % len(kept)]))
-        scans.append(replace(scan, boundaries=with_points(boundaries)))
+        scans.append(replaced(scan, boundaries=with_points(boundaries)))
     return replace(drive, scans=tuple(scans))
 
 
@@ -46,5 +71,5 @@ def without_kind(drive: Drive, kind: Edge) -> Drive:
     scans = []
     for scan in drive.scans:
         kept = {c: points.take(np.flatnonzero(points.edges != kind)) for c, points in scan.boundaries.items()}
-        scans.append(replace(scan, boundaries=with_points(kept)))
+        scans.append(replaced(scan, boundaries=with_points(kept)))
     return replace(drive, scans=tuple(scans))

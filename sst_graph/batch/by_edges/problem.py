@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 
 from sst_graph.association.time_pairing import pair_by_time
-from sst_graph.batch.by_edges.parts import thinned
+from sst_graph.batch.by_edges.parts import thinned, thinned_together
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.drive.edges_of_frames import with_edges
@@ -20,7 +20,7 @@ from sst_graph.edges.search import KnownRotation, SearchRegion
 from sst_graph.errors import EstimationError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.graph.known import KnownCalibration, motion_steps
-from sst_graph.graph.matching import DriveEdges, edges_of
+from sst_graph.graph.matching import MOST_POINTS, DriveEdges, edges_of
 from sst_graph.graph.outer_loop import JointProblem
 from sst_graph.graph.state import State, difference
 from sst_graph.hand_eye.solution import MotionSolution, alternative, solve_motion
@@ -194,7 +194,7 @@ def edges_problem(
     guessed = labels.state is None and guess.cTl is not None
     checking = None if labels.has_motion else checking_motion(motion, calibration.config)
     known = _prior(centre, checking, guessed, drives[0].camera)
-    whole = replace(joint, centre=centre, prior=known)
+    whole = replace(joint, drives=thinned_together(drives, MOST_POINTS), centre=centre, prior=known)
     scans = [_some_scans(drive, guess.time_offset_s) for drive in drives]
     parts = [drive.part(own) for drive, own in zip(drives, scans, strict=True)]
     motions = [motion.part(own) for motion, own in zip(joint.motions, scans, strict=True)]
