@@ -182,7 +182,7 @@ def _accuracy(result: CalibrationResult) -> str:
 def _next(inspection: Inspection) -> str:
     result = inspection.result
     weak = [
-        f"{one.sentence}: {one.advice}"
+        one.reason
         for one in result.weak_directions
         if not any(one.sentence in reason for reason in result.reasons)
     ]

@@ -9,6 +9,7 @@ import numpy as np
 from sst_graph.batch.assumption_tests import assumption_report
 from sst_graph.batch.method_estimate import package_versions
 from sst_graph.config import to_dict
+from sst_graph.covariance.observability import reasons_of
 from sst_graph.factors.arguments import checked_type
 from sst_graph.inspect.gained import KEY, to_document
 from sst_graph.result import CalibrationResult, FrameId, Status
@@ -34,7 +35,7 @@ def tracker_result(tracker: Tracker, drive: str, camera_name: str) -> Calibratio
     checked_type("drive", drive, str, "a text")
     last, estimate, window = current_update(tracker), tracker.estimate, tracker.inputs.window
     status: Status = "ok" if last.status == "ok" else "not_converged"
-    reasons = tuple(f"{weak.sentence}: {weak.advice}" for weak in last.weak_directions)
+    reasons = reasons_of(last.weak_directions)
     if last.status == "unobservable":
         status = "unobservable"
     elif last.status == "contradicted":
