@@ -125,8 +125,25 @@ class IndexedSource(ABC):
     def __len__(self) -> int:
         return len(self.indices)
 
-    @abstractmethod
+    @overload
     def __getitem__(self, position: int) -> Frame: ...
+    @overload
+    def __getitem__(self, position: slice) -> Self: ...
+    def __getitem__(self, position: int | slice) -> Frame | Self:
+        """Frame at a position (read from disk), or the drive restricted to a slice of positions.
+
+        Raises:
+            DataError: a file of the frame is truncated, damaged or holds what it must not; neither a whole
+                number nor a slice.
+            IndexError: no frame at this position.
+        """
+        if isinstance(position, slice):
+            return replace(self, indices=self.indices[checked_slice(position, len(self))])
+        return self._frame(position)
+
+    @abstractmethod
+    def _frame(self, position: int) -> Frame:
+        """Frame at a position; errors as of ``self[position]``."""
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[position] for position in range(len(self)))
@@ -143,10 +160,6 @@ class IndexedSource(ABC):
             IndexError: no frame at this position.
         """
         return self.indices[checked_position(position, len(self), slices=True)]
-
-    def _part(self, positions: slice) -> Self:
-        """The drive restricted to a slice of positions."""
-        return replace(self, indices=self.indices[checked_slice(positions, len(self))])
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,19 +188,7 @@ class TwoClockSource(IndexedSource):
         """Positions of the frames that have an image."""
         return [k for k, index in enumerate(self.indices) if self.places[index].image is not None]
 
-    @overload
-    def __getitem__(self, position: int) -> Frame: ...
-    @overload
-    def __getitem__(self, position: slice) -> TwoClockSource: ...
-    def __getitem__(self, position: int | slice) -> Frame | TwoClockSource:
-        """Frame at a position (read from disk), or the drive restricted to a slice of positions.
-
-        Raises:
-            DataError: a file of the frame cannot be used; neither a whole number nor a slice.
-            IndexError: no frame at this position.
-        """
-        if isinstance(position, slice):
-            return self._part(position)
+    def _frame(self, position: int) -> Frame:
         return Frame(self._index(position), self.read_scan(position), self.read_image(position))
 
     @property

@@ -17,7 +17,6 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,20 +68,7 @@ class KittiSource(IndexedSource):
     pictures: PictureFiles
     timing: SweepTiming | None = None
 
-    @overload
-    def __getitem__(self, position: int) -> Frame: ...
-    @overload
-    def __getitem__(self, position: slice) -> KittiSource: ...
-    def __getitem__(self, position: int | slice) -> Frame | KittiSource:
-        """Frame at a position (read from disk), or the drive restricted to a slice of positions.
-
-        Raises:
-            DataError: a file of the frame is truncated, damaged or holds what it must not; neither a whole
-                number nor a slice.
-            IndexError: no frame at this position.
-        """
-        if isinstance(position, slice):
-            return self._part(position)
+    def _frame(self, position: int) -> Frame:
         index = self._index(position)
         scan, image = self._scan(index), self._image(index)
         if image is not None:
