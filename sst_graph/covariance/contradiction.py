@@ -93,16 +93,14 @@ class Difference:
         Args:
             own_offsets: each part has a time offset of its own: only the extrinsics are compared.
         """
-        names, around = _names(*others, one), combined(others).step
-        sums = _Sums.joined([_Sums.of(each, around, names) for each in others])
+        sums = _Sums.joined(_Sums.of_each(others, _names(*others, one)))
         return cls._from_sums(sums, one, own_offsets)
 
     @classmethod
     def each_from_others(cls, parts: Sequence[PartEstimate]) -> list[Difference]:
         """:meth:`from_others` of every part: their equations are summed once from either end, not anew for
         each."""
-        names, around = _names(*parts), combined(parts).step
-        own = [_Sums.of(each, around, names) for each in parts]
+        own = _Sums.of_each(parts, _names(*parts))
         before, after = (list(accumulate(each)) for each in (own, reversed(own)))
         others = (_Sums.joined([*before[:k][-1:], *after[: len(own) - k - 1][-1:]]) for k in range(len(own)))
         return [cls._from_sums(sums, one, False) for sums, one in zip(others, parts, strict=True)]
@@ -164,8 +162,7 @@ def disagreement(estimates: Sequence[PartEstimate]) -> float:
 
     The least over x and a of sum (d_k - x - S_k a)' L_k (d_k - x - S_k a) + a' a.
     """
-    names, around = _names(*estimates), combined(estimates).step
-    return _Sums.joined([_Sums.of(each, around, names) for each in estimates]).solved()[2]
+    return _Sums.joined(_Sums.of_each(estimates, _names(*estimates))).solved()[2]
 
 
 @dataclass(frozen=True)
@@ -188,10 +185,13 @@ class _Sums:
     clusters: float
 
     @classmethod
-    def of(cls, part: PartEstimate, around: FloatArray, names: Sequence[str]) -> _Sums:
-        """Of one part."""
-        J, d, L = _design(part, names), part.step - around, np.linalg.inv(part.covariance)
-        return cls(around, names, J.T @ L @ J, J.T @ L @ d, float(d @ L @ d), part.clusters)
+    def of_each(cls, parts: Sequence[PartEstimate], names: Sequence[str]) -> list[_Sums]:
+        """Of each part alone, all about their mean."""
+        around, found = combined(parts).step, []
+        for part in parts:
+            J, d, L = _design(part, names), part.step - around, np.linalg.inv(part.covariance)
+            found.append(cls(around, names, J.T @ L @ J, J.T @ L @ d, float(d @ L @ d), part.clusters))
+        return found
 
     def __add__(self, other: _Sums) -> _Sums:
         return replace(
