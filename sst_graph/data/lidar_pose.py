@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from sst_graph.data.scan_order import rings_from_order
 from sst_graph.data.source_view import ChangedSource
 from sst_graph.errors import ConfigError
+from sst_graph.sweep_timing import SweepTiming
 from sst_graph.types import GroundTruth, Scan, Source
 
 _EXPECTED = "expected X,Y,Z or X,Y,Z,ROLL,PITCH,YAW [m, deg]"
@@ -45,10 +47,35 @@ def lidar_pose_text(T_cloud_lidar: gtsam.Pose3) -> str:
     return f"{metres},{turned}" if angles.any() else metres
 
 
+def _moved(points: NDArray[np.float32], T_cloud_lidar: gtsam.Pose3) -> NDArray[np.float32]:
+    """Points (n, 3) in the LiDAR's axes [m]."""
+    R, t = T_cloud_lidar.rotation().matrix(), T_cloud_lidar.translation()
+    return np.asarray(((points.astype(np.float64) - t) @ R).astype(np.float32))
+
+
+@dataclass(frozen=True)
+class TimingFromCloud(SweepTiming):
+    """Times of points in the cloud's axes, by their azimuths about the LiDAR.
+
+    Attributes:
+        T_cloud_lidar: where the LiDAR is in them.
+    """
+
+    T_cloud_lidar: gtsam.Pose3 = field(default_factory=gtsam.Pose3)
+
+    @classmethod
+    def of(cls, timing: SweepTiming, T_cloud_lidar: gtsam.Pose3) -> TimingFromCloud:
+        """The timing of a LiDAR for points that are not in its axes."""
+        return cls(timing.fraction, timing.start_rad, timing.period_s, timing.stamp, T_cloud_lidar)
+
+    def offsets_s(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Time (n,) of points (n, 3) in the cloud's axes [m] relative to the stamp [s]."""
+        return super().offsets_s(_moved(points, self.T_cloud_lidar))
+
+
 def in_lidar_axes(scan: Scan, T_cloud_lidar: gtsam.Pose3) -> Scan:
     """A scan moved to the LiDAR's axes. Lasers that its order shows are seen from there."""
-    R, t = T_cloud_lidar.rotation().matrix(), T_cloud_lidar.translation()
-    points = ((scan.points.astype(np.float64) - t) @ R).astype(np.float32)
+    points = _moved(scan.points, T_cloud_lidar)
     by_order = rings_from_order(points)
     return replace(scan, points=points, rings=scan.rings if by_order is None else by_order)
 

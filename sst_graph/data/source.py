@@ -11,7 +11,7 @@ from typing import Literal, TypedDict, Unpack, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.data.lidar_pose import LidarFrameSource, parse_lidar_pose
+from sst_graph.data.lidar_pose import LidarFrameSource, TimingFromCloud, parse_lidar_pose
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.factors.arguments import described, is_whole
 from sst_graph.files.reading import path_of
@@ -122,11 +122,6 @@ class SourceOptions:
             _check_frames(self.frames)
         if self.lidar_pose is not None:
             parse_lidar_pose(self.lidar_pose)
-            if self.sweep in TURNS:
-                raise ConfigError(
-                    f"sweep {self.sweep}: found a lidar pose, with which times do not follow from azimuths "
-                    "about the cloud's origin: expected auto, or points with times"
-                )
 
     def timing(self, stamps_ns: NDArray[np.int64]) -> SweepTiming | None:
         """Times of points by azimuth, where a sense of rotation is named; stamps_ns: (n,) of the scans.
@@ -140,7 +135,10 @@ class SourceOptions:
             raise ConfigError(f"sweep {self.sweep!r}: the period of a turn needs two scans or more")
         period_s = float(np.median(np.diff(stamps_ns))) * 1e-9
         start_rad = float(np.radians(self.sweep_start_deg))
-        return SweepTiming(TURNS[self.sweep], start_rad, period_s, self.sweep_stamp)
+        timing = SweepTiming(TURNS[self.sweep], start_rad, period_s, self.sweep_stamp)
+        if self.lidar_pose is None:
+            return timing
+        return TimingFromCloud.of(timing, parse_lidar_pose(self.lidar_pose))
 
 
 BAG_OPTIONS = ("image_topic", "cloud_topic", "info_topic", "camera_file", "mask_topic", "stamps")

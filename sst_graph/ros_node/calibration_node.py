@@ -11,7 +11,7 @@ import numpy as np
 
 from sst_graph.cameras import Rectification
 from sst_graph.classes import MaskEncoding
-from sst_graph.data.lidar_pose import in_lidar_axes, parse_lidar_pose
+from sst_graph.data.lidar_pose import TimingFromCloud, in_lidar_axes, parse_lidar_pose
 from sst_graph.data.ros.bag import TF_MESSAGE
 from sst_graph.data.ros.camera_info import ImageGeometry, image_geometry
 from sst_graph.data.ros.frames import CloudReading, check_size, mask_classes, scan_of
@@ -389,6 +389,8 @@ def _reading(settings: NodeSettings) -> CloudReading:
     timing = None
     if settings.sweep in TURNS:
         timing = SweepTiming(TURNS[settings.sweep], np.pi, settings.sweep_period_s)
+        if settings.lidar_pose:
+            timing = TimingFromCloud.of(timing, parse_lidar_pose(settings.lidar_pose))
     return CloudReading(timing, settings.sweep == "auto", bool(settings.mask_topic))
 
 

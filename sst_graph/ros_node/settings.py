@@ -66,11 +66,6 @@ class NodeSettings(Settings):
         for name in ("image_topic", "info_topic", "cloud_topic", "init"):
             if not getattr(self, name):
                 raise ConfigError(f"{name}: found an empty name, expected one")
-        if self.lidar_pose and self.sweep in TURNS:
-            raise ConfigError(
-                f"sweep: found {self.sweep} with a lidar_pose, with which times do not follow from azimuths "
-                "in the cloud; expected auto or compensated"
-            )
 
 
 def parameter_defaults() -> dict[str, Any]:

@@ -12,13 +12,19 @@ import pytest
 from stored import simulated, written
 
 from sst_graph import open_source
-from sst_graph.data.lidar_pose import LidarFrameSource, lidar_pose_text, parse_lidar_pose
+from sst_graph.data.lidar_pose import (
+    LidarFrameSource,
+    TimingFromCloud,
+    lidar_pose_text,
+    parse_lidar_pose,
+)
 from sst_graph.data.source_view import ChangedSource
 from sst_graph.diagnosis.lasers import other_axes
 from sst_graph.drive.input_statistics import StatisticsCollector
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import ConfigError
 from sst_graph.simulator import SimulationConfig
+from sst_graph.sweep_timing import SweepTiming
 from sst_graph.types import Scan, Source
 
 POSE = "1.4,0.1,1.6,0,2,17"
@@ -51,9 +57,26 @@ def test_what_is_no_pose_is_refused(text: str) -> None:
         open_source("none", lidar_pose=text)
 
 
-def test_times_by_azimuth_are_refused_with_it() -> None:
-    with pytest.raises(ConfigError, match="sweep clockwise: found a lidar pose"):
-        open_source("none", lidar_pose=POSE, sweep="clockwise")
+def test_times_by_azimuth_are_those_about_the_lidar() -> None:
+    """Points as the vehicle's driver publishes them get the times that they have in the LiDAR's own axes."""
+    drive, pose = simulated(STREET), parse_lidar_pose(POSE)
+    scan = drive[1].scan
+    assert scan is not None
+    timing = SweepTiming(-1.0, np.pi, 0.1)
+    in_vehicle = np.array([pose.transformFrom(p) for p in scan.points.astype(np.float64)], np.float32)
+    own, seen = timing.offsets_s(scan.points), TimingFromCloud.of(timing, pose).offsets_s(in_vehicle)
+    np.testing.assert_allclose(seen, own, atol=1e-6)
+    assert np.ptp(own) > 0.02 and np.abs(timing.offsets_s(in_vehicle) - own).max() > 1e-3
+
+
+def test_a_named_sweep_and_a_pose_go_together() -> None:
+    options: dict[str, Any] = {"lidar_pose": "0.5,0,0", "sweep": "counterclockwise"}
+    first, scan, last = (frame.scan for frame in open_source(written(STREET), **options))
+    assert first is not None and last is not None and scan is not None and scan.offsets_s is not None
+    # The scan is in the LiDAR's axes by now, and so are its azimuths.
+    turn = np.arctan2(scan.points[:, 1], scan.points[:, 0]) / (2.0 * np.pi)
+    period_s = 0.5e-9 * (last.stamp_ns - first.stamp_ns)
+    np.testing.assert_allclose(scan.offsets_s, period_s * turn, atol=1e-6)
 
 
 def test_the_drive_is_as_in_the_axes_of_the_lidar() -> None:

@@ -318,7 +318,6 @@ def test_queues_are_bounded(bag: Any, config: TrackerConfig) -> None:
         {"queue": 1},
         {"cloud_topic": ""},
         {"lidar_pose": "1.4,0"},
-        {"sweep": "clockwise", "lidar_pose": "1.4,0,1.7"},
     ],
 )
 def test_wrong_parameters_are_refused(changes: dict[str, Any]) -> None:
