@@ -10,7 +10,7 @@ import numpy as np
 
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.contradictions import FALSE_ALARM
-from sst_graph.batch.part_solver import SolvedPart
+from sst_graph.batch.part_solver import PartSolver, SolvedPart
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.covariance.contradiction import Difference, PartEstimate, name_step
 from sst_graph.drive.preparation import Drive
@@ -108,9 +108,7 @@ def fuse_motion(
         return _left_out(labels, f"the motion was left out: {motion.misfit}", facts)
     if chi2 > MAX_DISAGREEMENT_CHI2 or not motion.converged:
         return WithMotion(labels, _contradiction(step, chi2, motion), facts)
-    own = PartEstimate(step, motion.covariance)
-    compared = [(stretch, Difference.of(stretch.step, own)) for stretch in stretches]
-    worst = min(compared, key=lambda pair: pair[1].rank, default=None)
+    worst = _worst_stretch(PartSolver(problem, state), stretches, motion, step)
     if worst is not None:
         facts["stretch_p_value"] = worst[1].p_value * len(stretches)
         if facts["stretch_p_value"] < FALSE_ALARM:
@@ -123,6 +121,31 @@ def fuse_motion(
     fused = JointEstimate.of(solution, problem.objects)
     fused = replace(fused, covariance=inflation * fused.covariance)
     return WithMotion(fused, diagnostics={"fused": True, **facts})
+
+
+def _worst_stretch(
+    parts: PartSolver, stretches: Sequence[SolvedPart], motion: MotionSolution, step: FloatArray
+) -> tuple[SolvedPart, Difference] | None:
+    """The stretch whose labels contradict the motion most, and the difference; None without stretches.
+
+    Where it is significant, the stretch is solved from the motion's estimate, too: what it says is the
+    optimum that contradicts the motion least, of those that it supports.
+
+    Args:
+        step: (7,) from the labels' estimate to what motion says.
+    """
+    own = PartEstimate(step, motion.covariance)
+
+    def compared(stretch: SolvedPart) -> Difference:
+        difference = Difference.of(stretch.step, own)
+        if difference.p_value * len(stretches) >= FALSE_ALARM:
+            return difference
+        start = State(motion.state.cTl, (motion.state.time_offsets_s[0],))
+        found = [Difference.of(each.step, own) for each in parts.estimates(stretch, start)]
+        return max(found, key=lambda each: each.rank)
+
+    every = [(stretch, compared(stretch)) for stretch in stretches]
+    return min(every, key=lambda pair: pair[1].rank, default=None)
 
 
 def _disagreement(motion: KnownCalibration, labels: JointEstimate) -> tuple[FloatArray, FloatArray]:

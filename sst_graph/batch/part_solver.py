@@ -26,6 +26,10 @@ _FAR_MORE = 2.0
 """A solution one frame away must begin with this many times the support of the one found. Where a scan was
 lost at 9 m/s it has four times that."""
 
+_NEARLY = 0.9
+"""Share of the support of one optimum that another has which a part leaves open, too. Two optima of five
+frames of a clean street, 34 cm and 0.6 deg apart, had 229 and 227 matches."""
+
 
 @dataclass(frozen=True)
 class Part:
@@ -99,6 +103,16 @@ class PartSolver:
     def solve_from(self, part: Part, start: State) -> SolvedPart | None:
         """The same from a start that is nearly right."""
         return self._solved(part, start, self.kernels_px[len(self.kernels_px) // 2 :])
+
+    def estimates(self, found: SolvedPart, start: State) -> tuple[SolvedPart, ...]:
+        """A part's estimate, and the one from another start where the part supports that nearly as well: the
+        few objects of some frames may leave two optima open."""
+        part = found.part
+        other = self.solve_from(part, start)
+        if other is None:
+            return (found,)
+        enough = _NEARLY * self.total_support(part, found.state)
+        return (found, other) if self.total_support(part, other.state) >= enough else (found,)
 
     def best_start(self, part: Part, starts: Sequence[State]) -> State:
         """The reference, or the one of other states, with the largest support of the part."""

@@ -255,25 +255,58 @@ def test_a_part_without_common_labels_has_no_estimate() -> None:
     assert find_contradictions(parts).sentences == ()
 
 
-def test_motion_that_contradicts_a_stretch_is_left_out() -> None:
-    drives = prepared()
-    parts = parts_of(drives)
-    objects = parts.problem.objects
+def turned_scans(drive: Drive, scans: Sequence[int], degrees: float) -> Drive:
+    """The edges of some scans as a LiDAR sees them that is turned about its y axis."""
+    R = gtsam.Rot3.Ry(np.radians(degrees)).matrix()
+    found = list(drive.scans)
+    for k in scans:
+        edges = {
+            c: replace(each, lPs=each.lPs @ R.T, outward=each.outward @ R.T)
+            for c, each in drive.scans[k].boundaries.items()
+        }
+        found[k] = replace(drive.scans[k], boundaries=edges)
+    return replace(drive, scans=tuple(found))
+
+
+TURN_DEG = 20.0
+SIGMAS = np.array([0.001] * 3 + [0.01] * 3 + [0.003])
+SURE = np.diag(np.array([0.01] * 3 + [1.0] * 3 + [0.01]) ** 2)
+
+
+def labels_and_stretch(drive: Drive) -> tuple[PartSolver, JointEstimate, SolvedPart]:
+    """Labels that know little, and a stretch that claims to be turned from them, whatever its scans show."""
+    parts = parts_of([drive])
     joint = replace(parts.problem.joint(), config=JointConfig())
     solution = solve_joint(joint, parts.reference, (5.0, 3.0))
-    sigmas = np.array([0.001] * 3 + [0.01] * 3 + [0.003])
-    sure = np.diag(np.array([0.01] * 3 + [1.0] * 3 + [0.01]) ** 2)
-    agrees = SolvedPart(Part(0, (0, 1, 2, 3)), solution.state, PartEstimate(np.zeros(7), sure))
+    labels = known_to(JointEstimate.of(solution, parts.problem.objects), SIGMAS)
     away = np.zeros(7)
-    away[1] = np.radians(20.0)
-    differs = SolvedPart(Part(0, (4, 5, 6, 7)), solution.state, PartEstimate(away, np.diag(sigmas**2)))
+    away[1] = -np.radians(TURN_DEG)
+    state = replace(solution.state, cTl=solution.state.cTl.retract(away[:6]))
+    return parts, labels, SolvedPart(Part(0, (4, 5, 6, 7)), state, PartEstimate(away, np.diag(SIGMAS**2)))
+
+
+def test_motion_that_contradicts_a_stretch_is_left_out() -> None:
+    (drive,) = prepared()
+    parts, labels, differs = labels_and_stretch(turned_scans(drive, range(4, 8), TURN_DEG))
+    agrees = SolvedPart(Part(0, (0, 1, 2, 3)), labels.solution.state, PartEstimate(np.zeros(7), SURE))
     for stretches, used in (([agrees], True), ([agrees, differs], False)):
-        labels = known_to(JointEstimate.of(solution, objects), sigmas)
         found = fuse_motion(parts.problem, labels, stretches)
         assert bool(found.diagnostics.get("fused")) is used
         assert (found.estimate is labels) is not used
         assert bool(found.remarks) is not used
     assert "frames 4 to 7" in found.remarks[0]
+
+
+def test_a_stretch_with_an_optimum_that_agrees_contradicts_no_motion() -> None:
+    """The same claim; but the scans of the stretch support what the motion says."""
+    (drive,) = prepared()
+    parts, labels, differs = labels_and_stretch(drive)
+    found = fuse_motion(parts.problem, labels, [differs])
+    assert found.diagnostics["fused"] and not found.remarks
+    # Where they do not, no other optimum counts, and nor does one that the part has no match at.
+    turned = parts_of([turned_scans(drive, range(4, 8), TURN_DEG)])
+    assert turned.estimates(differs, labels.solution.state) == (differs,)
+    assert len(parts.estimates(differs, labels.solution.state)) == 2
 
 
 def known_to(labels: JointEstimate, sigmas: FloatArray) -> JointEstimate:
