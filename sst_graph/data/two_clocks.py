@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.data.info.facts import SensorFacts, SourceFacts
+from sst_graph.data.scan_order import rings_from_order
 from sst_graph.data.source import SourceOptions, Sweep
 from sst_graph.errors import ConfigError, DataError, count_of
 from sst_graph.factors.camera import PinholeCamera
@@ -238,14 +239,18 @@ def merged(
     images: Sensor[CameraImage],
     options: SourceOptions,
     folder: Path,
+    scans_are_complete: bool = False,
 ) -> TwoClockSource:
     """The drive of a LiDAR and a camera.
 
     ``options.frames`` counts frames in the order of stamps. With ``options.image_shift`` image k is image
-    k + shift, stamped as image k; the truth's time offset follows.
+    k + shift, stamped as image k; the truth's time offset follows. Scans whose sweep ``options.sweep`` names
+    get their points' times from azimuths, or none; scans without laser numbers those that the order of their
+    points shows.
 
     Args:
         folder: named in errors.
+        scans_are_complete: the reader of the scans has followed ``options.sweep`` and numbered the lasers.
 
     Raises:
         DataError: no scan or no image, or stamps of a sensor that do not rise strictly.
@@ -262,8 +267,25 @@ def merged(
             truth = replace(truth, time_offset_s=truth.time_offset_s + seconds)
             properties = replace(properties, truth=truth)
     properties = replace(properties, sweep=options.sweep, sweep_stamp=options.sweep_stamp)
+    if not scans_are_complete:
+        scans = replace(scans, read=_completed(scans, options))
     places = _places(scans.stamps_ns, images.stamps_ns)
     return TwoClockSource(properties, _selected(places, options), scans, images, places)
+
+
+def _completed(scans: Sensor[Scan], options: SourceOptions) -> Callable[[int], Scan]:
+    """Reads scans with laser numbers, and with times of their points as the options want them."""
+    timing, read = options.timing(scans.stamps_ns), scans.read
+
+    def completed(k: int) -> Scan:
+        scan = read(k)
+        rings = rings_from_order(scan.points) if scan.rings is None else scan.rings
+        offsets_s = scan.offsets_s if options.sweep == "auto" else None
+        if timing is not None:
+            offsets_s = timing.offsets_s(scan.points)
+        return replace(scan, rings=rings, offsets_s=offsets_s)
+
+    return completed
 
 
 def _places(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import cast
 
 import gtsam
 import numpy as np
@@ -16,6 +17,7 @@ from sst_graph.cli.pictures import ShownFrame, telling_positions
 from sst_graph.data import SourceOptions, open_source
 from sst_graph.data.frame_parts import RecentReader
 from sst_graph.data.info import drive_info
+from sst_graph.data.source import Sweep
 from sst_graph.data.two_clocks import DriveProperties, Sensor, TwoClockSource, merged
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.factors import PinholeCamera
@@ -70,6 +72,36 @@ def test_frames_are_chosen_in_the_order_of_stamps() -> None:
                 SourceOptions(frames=frames),
                 Path("d"),
             )
+
+
+def test_scans_get_what_their_reader_leaves_to_the_options() -> None:
+    """Laser numbers by the order of the points, times by azimuth or none; a complete reader keeps its own."""
+    street = simulated(CROWDED_STREET)
+    given = [scan for k in range(3) if (scan := street[k].scan) is not None]
+    own_s = np.full(len(given[0].points), 0.01, np.float32)
+    bare = [dataclasses.replace(scan, rings=None, offsets_s=own_s[: len(scan.points)]) for scan in given[:1]]
+    bare += [dataclasses.replace(scan, rings=None, offsets_s=None) for scan in given[1:]]
+    stamps = np.array([scan.stamp_ns for scan in given])
+    scans, images = Sensor(stamps, lambda k: bare[k]), images_of(stamps.tolist())
+
+    def read(sweep: Sweep, complete: bool = False) -> list[Scan]:
+        source = merged(PROPERTIES, scans, images, SourceOptions(sweep=sweep), Path("d"), complete)
+        return [frame.scan for frame in source if frame.scan is not None]
+
+    for scan, expected in zip(read("auto"), given, strict=True):
+        assert scan.rings is not None and expected.rings is not None
+        assert len(np.unique(scan.rings)) == len(np.unique(expected.rings))
+    assert [scan.offsets_s is not None for scan in read("auto")] == [True, False, False]
+    assert [scan.offsets_s for scan in read("compensated")] == [None, None, None]
+    for sweep, sense in (("clockwise", -1.0), ("counterclockwise", 1.0)):
+        for scan in read(cast(Sweep, sweep)):
+            turn = np.arctan2(scan.points[:, 1], scan.points[:, 0]) / (2.0 * np.pi)
+            expected_s = sense * turn * float(np.median(np.diff(stamps))) * 1e-9
+            assert scan.offsets_s is not None
+            np.testing.assert_allclose(scan.offsets_s, expected_s, atol=1e-6)
+    kept = read("clockwise", complete=True)
+    np.testing.assert_array_equal(kept[0].offsets_s, own_s)
+    assert kept[1].offsets_s is None and kept[0].rings is None
 
 
 @pytest.mark.parametrize(("shift", "shown"), [(1, [1, 2]), (-1, [0, 1])])

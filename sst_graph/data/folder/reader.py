@@ -24,11 +24,9 @@ from sst_graph.data.folder.stamps import StampedFiles, stamped_files
 from sst_graph.data.pictures import PictureFiles, mask_encoding, point_labels
 from sst_graph.data.point_files import SUFFIXES, PointFields, read_cloud
 from sst_graph.data.rectified import RectifiedSource
-from sst_graph.data.scan_order import rings_from_order
 from sst_graph.data.source import Loader, SourceOptions
 from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
 from sst_graph.errors import ConfigError, DataError, count_of, printable
-from sst_graph.sweep_timing import SweepTiming
 from sst_graph.types import CameraImage, Scan, Source, with_intensities
 
 _LOG = logging.getLogger(__name__)
@@ -56,13 +54,11 @@ class CloudFiles:
     Attributes:
         files: with their stamps.
         labels: paths of label files by position.
-        timing: times of points by azimuth, where the options name a sense of rotation.
         stored_times: take the times that the clouds hold.
     """
 
     files: StampedFiles
     labels: dict[int, Path]
-    timing: SweepTiming | None
     stored_times: bool
 
     def scan(self, k: int) -> Scan:
@@ -77,9 +73,7 @@ class CloudFiles:
         used: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
         classes, instances = self._labels(k, cloud, used)
         offsets_s = None
-        if self.timing is not None:
-            offsets_s = self.timing.offsets_s(points[used])
-        elif self.stored_times and (times := cloud.offsets_s(stamp_ns, used)) is not None:
+        if self.stored_times and (times := cloud.offsets_s(stamp_ns, used)) is not None:
             offsets_s = times[used]
         rings, intensities = cloud.rings(), cloud.intensities()
         points = np.ascontiguousarray(points[used])
@@ -89,7 +83,7 @@ class CloudFiles:
             classes=classes,
             instances=instances,
             offsets_s=offsets_s,
-            rings=rings_from_order(points) if rings is None else rings[used],
+            rings=None if rings is None else rings[used],
             left_out=len(used) - len(points),
         )
         return with_intensities(scan, None if intensities is None else intensities[used])
@@ -129,7 +123,6 @@ def open_folder(path: Path, options: SourceOptions) -> Source:
     scans = CloudFiles(
         clouds,
         _beside(clouds, path / "labels", (".label",)),
-        options.timing(clouds.stamps_ns),
         options.sweep == "auto",
     )
 

@@ -197,7 +197,7 @@ def _with_image_stamps(
     of_scans = Sensor(source.stamps_ns[scans], scan, _folder(files.scans))
     of_images = Sensor(image_stamps_ns[images], image, _folder(files.images or files.masks))
     properties = replace(source.properties, notes=(missing,) if missing else ())
-    return merged(properties, of_scans, of_images, options, folder)
+    return merged(properties, of_scans, of_images, options, folder, scans_are_complete=True)
 
 
 def _select(files: KittiFiles, options: SourceOptions, count: int) -> tuple[int, ...]:

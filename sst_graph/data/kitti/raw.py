@@ -164,7 +164,7 @@ def open_raw(path: Path, options: SourceOptions) -> Source:
     properties = DriveProperties(name, model.intrinsics, nominal, truth, is_reference, nominal_reason=reason)
     of_scans = Sensor(scan_stamps, scan, "velodyne_points")
     of_images = Sensor(image_stamps, image, f"image_{number:02d}")
-    source = merged(properties, of_scans, of_images, options, drive)
+    source = merged(properties, of_scans, of_images, options, drive, scans_are_complete=True)
     return source if model.is_pinhole else RectifiedSource(source, Rectification.of(model))
 
 

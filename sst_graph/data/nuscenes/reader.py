@@ -30,7 +30,6 @@ from sst_graph.data.source import Loader, SourceOptions
 from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
 from sst_graph.errors import ConfigError, DataError, count_of, printable
 from sst_graph.files.reading import FileKind, read_file
-from sst_graph.sweep_timing import SweepTiming
 from sst_graph.types import CameraImage, GroundTruth, Scan, SemanticClass, Source, with_intensities
 
 _LOG = logging.getLogger(__name__)
@@ -65,13 +64,11 @@ class LidarFiles:
         stamps_ns: (n,) [ns].
         paths: of the clouds.
         labels: of the lidarseg labels, by position.
-        timing: times of points by azimuth, where the options name a sense of rotation.
     """
 
     stamps_ns: NDArray[np.int64]
     paths: tuple[Path, ...]
     labels: Mapping[int, Path] = field(default_factory=dict)
-    timing: SweepTiming | None = None
 
     def scan(self, k: int) -> Scan:
         """Scan k.
@@ -91,12 +88,10 @@ class LidarFiles:
         if not ((rings >= 0) & (rings < 256) & (rings == np.floor(rings))).all():
             raise DataError(path, "rings that are no whole numbers of 0 to 255", _PCD_BIN.name)
         points = np.ascontiguousarray(points[used])
-        offsets_s = None if self.timing is None else self.timing.offsets_s(points)
         scan = Scan(
             stamp_ns=int(self.stamps_ns[k]),
             points=points,
             classes=self._classes(k, used),
-            offsets_s=offsets_s,
             rings=rings.astype(np.uint16),
             left_out=len(used) - len(points),
         )
@@ -139,7 +134,7 @@ def open_nuscenes(path: Path, options: SourceOptions) -> Source:
     size = (model.width, model.height)
     pictures = PictureFiles(size, dict(enumerate(_paths(path, tables, camera))))
     image_stamps = _stamps(tables, camera)
-    scans = _lidar_files(path, tables, lidar, options)
+    scans = _lidar_files(path, tables, lidar)
 
     def image(k: int) -> CameraImage:
         return pictures.image(k, int(image_stamps[k]))
@@ -280,7 +275,7 @@ def _inside(path: Path, filename: str, tables: Path) -> Path:
     return path.joinpath(*parts)
 
 
-def _lidar_files(path: Path, tables: Path, lidar: Channel, options: SourceOptions) -> LidarFiles:
+def _lidar_files(path: Path, tables: Path, lidar: Channel) -> LidarFiles:
     stamps_ns = _stamps(tables, lidar)
     labels: dict[int, Path] = {}
     lidarseg = tables / "lidarseg.json"
@@ -292,7 +287,7 @@ def _lidar_files(path: Path, tables: Path, lidar: Channel, options: SourceOption
             file = _inside(path, text_of(record, "filename", lidarseg), tables)
             if k is not None and file.exists():
                 labels[k] = file
-    return LidarFiles(stamps_ns, _paths(path, tables, lidar), labels, options.timing(stamps_ns))
+    return LidarFiles(stamps_ns, _paths(path, tables, lidar), labels)
 
 
 NUSCENES_LOADER = Loader(recognizes=is_nuscenes, open=open_nuscenes, layout=LAYOUT)

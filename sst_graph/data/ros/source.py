@@ -169,7 +169,7 @@ def open_ros(path: Path, options: SourceOptions) -> Source:
     properties = DriveProperties(name, model.intrinsics, nominal, nominal_reason=reason, notes=tuple(notes))
     scans = Sensor(_stamps(index.clouds), messages.scan, _place_of(topics.cloud), topics.cloud.name)
     images = Sensor(_stamps(index.images), messages.image, _place_of(topics.image), topics.image.name)
-    drive = merged(properties, scans, images, options, path)
+    drive = merged(properties, scans, images, options, path, scans_are_complete=True)
     return drive if model.is_pinhole else RectifiedSource(drive, Rectification.of(model))
 
 
