@@ -83,10 +83,12 @@ class ScoreSums:
     @classmethod
     def of_frame(cls, J: FloatArray, roots: FloatArray, sides: IntArray, level: LevelEdges) -> ScoreSums:
         """Of the matches of one frame, from dense rows."""
-        names, scores = summed_rows(J * roots[:, None], sides)
-        _, by_edge = summed_rows(J * (roots * level.errors)[:, None], sides)
-        moments = level.moments(roots**2, np.searchsorted(names, sides), len(names))
-        errors = LevelSums.of_open(by_edge, moments)
+        names, side = np.unique(sides, return_inverse=True)
+        members = np.zeros((len(names), len(sides)))
+        members[side, np.arange(len(sides))] = roots
+        scores = members @ J
+        moments = level.moments(roots**2, side, len(names))
+        errors = LevelSums.of_open((members * level.errors) @ J, moments)
         return cls(J.T @ J, scores.T @ scores, np.zeros((J.shape[1],) * 2), names, scores, errors)
 
     def __add__(self, other: ScoreSums) -> ScoreSums:

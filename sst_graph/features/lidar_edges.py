@@ -391,20 +391,20 @@ def split_objects(
 
     The data's instances where all points carry one, else connected cells of a grid seen from above.
     """
-    objects = np.full(len(points), -1, dtype=np.intp)
-    members = points[mask, :2]
-    if instances is not None and bool((instances[mask] > 0).all()):
-        numbers = instances[mask].astype(np.intp)
+    objects, members = np.full(len(points), -1, dtype=np.intp), np.flatnonzero(mask)
+    if instances is not None and bool((instances[members] > 0).all()):
+        numbers = instances[members].astype(np.intp)
     else:
-        cells = np.floor(members / _CELL_M).astype(np.intp)
-        cells -= cells.min(axis=0) - 1
-        size = np.minimum(cells.max(axis=0) + 2, 4000)
+        plan = np.ascontiguousarray(points.take(members, axis=0)[:, :2].T)
+        cells = np.floor(plan / _CELL_M).astype(np.intp)
+        cells -= cells.min(axis=1, keepdims=True) - 1
+        size = np.minimum(cells.max(axis=1) + 2, 4000)
+        u, v = np.minimum(cells, size[:, None] - 1)
         grid = np.zeros(size, dtype=np.uint8)
-        cells = np.minimum(cells, size - 1)
-        grid[cells[:, 0], cells[:, 1]] = 1
+        grid[u, v] = 1
         grown = cv2.dilate(grid, np.ones((3, 3), np.uint8))
         _, regions = cv2.connectedComponents(grown, connectivity=4)
-        numbers = regions[cells[:, 0], cells[:, 1]].astype(np.intp)
+        numbers = regions[u, v].astype(np.intp)
     counts = np.bincount(numbers)
-    objects[mask] = np.where(counts[numbers] >= min_points, numbers, -1)
+    objects[members] = np.where(counts[numbers] >= min_points, numbers, -1)
     return objects

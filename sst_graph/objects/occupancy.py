@@ -160,10 +160,9 @@ class _Places:
         return cls(scan.stamp_ns, tuple(names), outlines, trees, scan, wTl)
 
     @cached_property
-    def _anything(self) -> cKDTree | None:
-        """All points but the ground's in the world; built when needed."""
-        raised = self.scan.lPs[_RAISED[self.scan.classes]]
-        return _tree(transformed_points(self.wTl, raised)) if len(raised) else None
+    def _raised(self) -> FloatArray:
+        """(n, 3) all points but the ground's in the world; made when needed [m]."""
+        return transformed_points(self.wTl, self.scan.lPs[_RAISED[self.scan.classes]])
 
     def found_in(self, other: _Places) -> dict[ObjectName, float]:
         """Share of each object's points whose place is occupied in another scan, by its class or anything."""
@@ -173,8 +172,8 @@ class _Places:
             numbers, which = np.unique(outlines.owners, return_inverse=True)
             count = np.bincount(which)
             free = (np.bincount(which, near) < _STATIC_SHARE * count)[which]
-            if free.any() and other._anything is not None:
-                near[free] |= outlines.take(free).near(other._anything)
+            if free.any():
+                near[free] |= outlines.take(free).near_some(other._raised)
             found = np.bincount(which, near) / count
             shares.update({(c, int(n)): float(share) for n, share in zip(numbers, found, strict=True)})
         return shares
@@ -196,6 +195,14 @@ class _Outlines:
         """(n,) whether a point of a tree lies within reach."""
         distances, _ = tree.query(self.wPs, distance_upper_bound=float(self.reaches_m.max()))
         return np.asarray(distances <= self.reaches_m)
+
+    def near_some(self, wPs: FloatArray) -> NDArray[np.bool_]:
+        """(n,) the same of points (m, 3) among which few are near: a tree of all would take longer."""
+        x, y = wPs[:, 0], wPs[:, 1]
+        reach = float(self.reaches_m.max())
+        (left, low, _), (right, high, _) = self.wPs.min(axis=0) - reach, self.wPs.max(axis=0) + reach
+        around = np.flatnonzero((x >= left) & (x <= right) & (y >= low) & (y <= high))
+        return self.near(_tree(wPs.take(around, axis=0)))
 
 
 def _tree(wPs: FloatArray) -> cKDTree:

@@ -7,10 +7,11 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from scipy.spatial.distance import cdist
 
 from sst_graph.drive.preparation import ScanFeatures
 from sst_graph.features.lidar_edges import Boundaries
-from sst_graph.objects.occupancy import OccupancyTest
+from sst_graph.objects.occupancy import OccupancyTest, _Outlines
 from sst_graph.types import SemanticClass
 
 VEHICLE, BUILDING = SemanticClass.VEHICLE, SemanticClass.BUILDING
@@ -138,3 +139,14 @@ def test_nothing_is_kept_of_scans_long_gone() -> None:
         test.add(k, scan(k, 0.1, [np.array([15.0, -4.0, 0.5])]), pose(k, 0.1))
     assert sorted(test.shares) == list(range(29, 40))
     assert len(test._places) <= 6
+
+
+def test_points_within_reach_are_found_among_many() -> None:
+    rng = np.random.default_rng(1)
+    wPs, reaches_m = rng.uniform(-5.0, 5.0, (40, 3)), rng.uniform(0.2, 1.0, 40)
+    many = rng.uniform(-20.0, 20.0, (20_000, 3))
+    outlines = _Outlines(wPs, reaches_m, np.zeros(40, np.intp))
+    expected = (cdist(wPs, many) <= reaches_m[:, None]).any(axis=1)
+    assert 5 < np.count_nonzero(expected) < 35
+    np.testing.assert_array_equal(outlines.near_some(many), expected)
+    assert not outlines.near_some(many[:0]).any()

@@ -9,7 +9,8 @@ import pytest
 
 from sst_graph import Tracker, TrackerConfig
 from sst_graph.simulator import SimulationConfig, simulate
-from sst_graph.tracker.sums.linearized_pair import PairColumns, linearize_pair
+from sst_graph.tracker.sums.linearized_pair import linearize_pairs
+from sst_graph.tracker.sums.rows import PairColumns
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +53,8 @@ def test_the_observed_information_predicts_the_gradient_elsewhere(tracker: Track
         there = linear.information.point.moved(step)
         tracks = tracker.inputs.window.tracks[number]
         columns = PairColumns(tracker.matcher.classes, tracks)
-        fresh = linearize_pair(entry.pair, there, columns).information.vector
+        (relinearized,) = linearize_pairs([entry.pair], there, [columns])
+        fresh = relinearized.information.vector
         own = slice(linear.information.point.core_size, linear.information.point.size)
         by_weight.append((linear.information.without_held().at(there).vector - fresh)[own].sum())
         by_curvature.append((linear.observed.without_held().at(there).vector - fresh)[own].sum())

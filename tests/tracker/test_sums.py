@@ -23,7 +23,8 @@ from sst_graph.graph.state import EXTRINSIC, State, bias_key, object_bias_key, t
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.simulator import SimulationConfig
 from sst_graph.tracker.monitor.statistic import ChangeStatistic, ComparedEstimate, EstimateCovariance
-from sst_graph.tracker.sums.linearized_pair import LinearizedPair, PairColumns, linearize_pair
+from sst_graph.tracker.sums.linearized_pair import LinearizedPair, linearize_pairs
+from sst_graph.tracker.sums.rows import PairColumns
 from sst_graph.tracker.sums.running_sums import RunningSums
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.types import SemanticClass
@@ -54,10 +55,7 @@ def matched() -> tuple[RobustCovariance, Point, list[LinearizedPair]]:
     seen = {t: 0 for pair in pairs for t in pair.tracks[VEHICLE].tolist()}
     point = Point.unbiased(state.cTl, OFFSET_S, [VEHICLE]).seen(seen)
     named = [{(c, n): track for (k, c, n), track in tracks.items() if k == pair.pair.scan} for pair in pairs]
-    linear = [
-        linearize_pair(pair, point, PairColumns([VEHICLE], own))
-        for pair, own in zip(pairs, named, strict=True)
-    ]
+    linear = linearize_pairs(pairs, point, [PairColumns([VEHICLE], own) for own in named])
     return robust, point, linear
 
 

@@ -107,10 +107,9 @@ class RunningSums:
 
         Args:
             window: pairs beside those added.
-            columns: of their unknowns, and of the held parameters where ``with_held``.
+            columns: of their unknowns and of what they hold.
             with_held: over the held parameters, too.
         """
-        n = self.size + self.held if with_held else self.size
-        past = self.scores.columns(slice(n))
-        seen = [pair.scores.columns(slice(len(own))) for pair, own in zip(window, columns, strict=True)]
-        return total(n, [past, *seen], [np.arange(n), *columns]).excess(model)
+        n = self.size + self.held
+        every = total(n, [self.scores, *(pair.scores for pair in window)], [np.arange(n), *columns])
+        return (every if with_held else every.columns(slice(self.size))).excess(model)

@@ -28,7 +28,8 @@ from sst_graph.points import transformed_points
 from sst_graph.tracker.by_edges.kinds import EDGE_KERNEL_SHARE, by_edges, by_labels, of_kind
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.sums.held import held_names
-from sst_graph.tracker.sums.linearized_pair import LinearizedPair, PairColumns, linearize_pair, with_share
+from sst_graph.tracker.sums.linearized_pair import LinearizedPair, linearize_pairs, with_share
+from sst_graph.tracker.sums.rows import PairColumns
 from sst_graph.tracker.window.epochs import MatchedPair
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.tracker.window.window import Window
@@ -104,16 +105,16 @@ class WindowMatcher:
         pairs, numbers = self._pairs(point, chosen, kernel or self.kernel)
         if kernel is None:
             self._last = (point, pairs)
-        stamps = self.window.stamps_ns()
-        found = {}
-        for number, pair in pairs.items():
-            if len(pair) >= _MIN_MATCHES:
-                pair = pair if share == 1.0 else with_share(pair, share)
-                by_object = not self.config.drift.enabled
-                linear = self._linearized(pair, number, point, share, by_object, self.held_names)
-                image = self.window.images[pair.pair.image]
-                out = self.left_out(pair, number, point.time_offset_s)
-                found[number] = MatchedPair(pair, linear, stamps[number], image.index, left_out=out)
+        kept = {number: pair for number, pair in pairs.items() if len(pair) >= _MIN_MATCHES}
+        if share != 1.0:
+            kept = {number: with_share(pair, share) for number, pair in kept.items()}
+        by_object = not self.config.drift.enabled
+        linear = self._linearized(kept, point, share, by_object, self.held_names)
+        stamps, found = self.window.stamps_ns(), {}
+        for (number, pair), own in zip(kept.items(), linear, strict=True):
+            image = self.window.images[pair.pair.image]
+            out = self.left_out(pair, number, point.time_offset_s)
+            found[number] = MatchedPair(pair, own, stamps[number], image.index, left_out=out)
         return found, set(numbers) - set(found)
 
     def linearized_at(
@@ -132,11 +133,8 @@ class WindowMatcher:
         """Matches of scans, made at a point, linearized there without the objects of some tracks."""
         if without:
             pairs = {number: self._leaving_out(pair, number, without) for number, pair in pairs.items()}
-        return [
-            self._linearized(pair, number, point, 1.0, by_object=False)
-            for number, pair in pairs.items()
-            if len(pair)
-        ]
+        some = {number: pair for number, pair in pairs.items() if len(pair)}
+        return self._linearized(some, point, 1.0, by_object=False)
 
     def in_view(self, point: Point, chosen: Collection[int], without: Collection[int]) -> dict[int, InView]:
         """What should be visible of the objects of scans that have an image, by the scan's number.
@@ -232,15 +230,14 @@ class WindowMatcher:
 
     def _linearized(
         self,
-        pair: PairMatches,
-        number: int,
+        pairs: Mapping[int, PairMatches],
         point: Point,
         share: float,
         by_object: bool,
         held: Sequence[str] = (),
-    ) -> LinearizedPair:
-        columns = PairColumns(self.classes, self.window.tracks[number], held, self.graph)
-        return linearize_pair(pair, point, columns, share, by_object)
+    ) -> list[LinearizedPair]:
+        columns = [PairColumns(self.classes, self.window.tracks[n], held, self.graph) for n in pairs]
+        return linearize_pairs(list(pairs.values()), point, columns, share, by_object)
 
     def _motion_of(self, part: Drive, numbers: list[int]) -> DriveMotion:
         """Of the LiDAR, made once a scan, and of the objects where they have biases."""

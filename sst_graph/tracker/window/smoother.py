@@ -363,8 +363,7 @@ class WindowSmoother:
             with_held: over the held parameters of ``past``, too.
         """
         window, point = [entry.linear for entry in self.entries.values()], self.past.point
-        held = self.past.held if with_held else 0
-        columns = [point.columns(pair.information.point.tracks, held) for pair in window]
+        columns = [point.columns(pair.information.point.tracks, self.past.held) for pair in window]
         return self.sums.excess(window, columns, self.model, with_held)
 
     @property
