@@ -10,6 +10,7 @@ import gtsam
 
 from sst_graph.errors import ConfigError
 from sst_graph.export.frames import OPTICAL_AXES, Rig
+from sst_graph.export.lens import Lens
 from sst_graph.export.text import hashed, heading, number, numbers, yaml_rows, yaml_text
 from sst_graph.result import CalibrationResult
 
@@ -87,18 +88,24 @@ def _words(rig: Rig, imu: str) -> list[str]:
     return [
         *lines,
         f"{at}: t_imu = t_cam + shift, with t_imu on the LiDAR's clock: shift = +time_offset_s",
-        "the images are rectified: no distortion",
+        *_of_lenses(rig),
     ]
 
 
+def _of_lenses(rig: Rig) -> list[str]:
+    distorted = any(Lens.of(result).distorts for result in rig.cameras.values())
+    return [] if distorted else ["the images are rectified: no distortion"]
+
+
 def _intrinsics(result: CalibrationResult, topic: str, pinhole: bool) -> str:
-    camera = result.camera
+    lens = Lens.of(result)
+    camera, distortion = lens.camera, ", ".join(numbers([lens.k1, lens.k2, 0.0, 0.0]))
     values = ", ".join(numbers([camera.fx, camera.fy, camera.cx, camera.cy]))
     return (
         ("  camera_model: pinhole\n" if pinhole else "")
         + f"  intrinsics: [{values}]\n"
         + "  distortion_model: radtan\n"
-        + "  distortion_coeffs: [0.0, 0.0, 0.0, 0.0]\n"
+        + f"  distortion_coeffs: [{distortion}]\n"
         + f"  resolution: [{camera.width}, {camera.height}]\n"
         + f"  {topic}: {yaml_text(result.image_topic or '/' + result.camera_name.lstrip('/'))}\n"
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import re
 from collections.abc import Mapping
 from typing import Any
@@ -14,10 +15,13 @@ import numpy as np
 
 from sst_graph.errors import ConfigError
 from sst_graph.export.frames import OPTICAL_AXES, Rig
+from sst_graph.export.lens import Lens
 from sst_graph.export.marginal import marginal_of_result
 from sst_graph.export.text import heading, row
 from sst_graph.imports.rotations import quaternion_xyzw
 from sst_graph.result import CalibrationResult
+
+_LOG = logging.getLogger(__name__)
 
 
 def kitti(rig: Rig) -> str:
@@ -27,7 +31,9 @@ def kitti(rig: Rig) -> str:
     take every line for numbers, so the file has no comments and no time offset.
     """
     result = _only(rig, "kitti", "its one Tr goes with one camera")
-    calibration = rig.options.kitti
+    calibration, lens = rig.options.kitti, Lens.of(result)
+    if lens.estimated and (lens.distorts or calibration is not None):
+        _LOG.warning("--to kitti: the file does not hold this: %s", "; ".join(lens.sentences))
     if calibration is not None:
         projections = dict(calibration.projections)
         c0Tl = calibration.cTc0(result.camera_name).inverse() * result.T_camera_lidar
@@ -35,7 +41,7 @@ def kitti(rig: Rig) -> str:
         camera = result.camera_name.removeprefix("image_").lstrip("0") or "0"
         own = int(camera) if re.fullmatch(r"\d", camera) else 0
         # One camera is known, and stands for all: pykitti wants four.
-        P = np.hstack([result.camera.matrix, np.zeros((3, 1))])
+        P = np.hstack([lens.camera.matrix, np.zeros((3, 1))])
         projections = dict.fromkeys(sorted({0, 1, 2, 3, own}), P)
         c0Tl = result.T_camera_lidar
     lines = [f"P{number}: {row(matrix)}" for number, matrix in sorted(projections.items())]
@@ -67,11 +73,11 @@ def opencv(rig: Rig) -> str:
 
 
 def _write_camera(storage: cv2.FileStorage, result: CalibrationResult) -> None:
-    T = result.T_camera_lidar
-    storage.write("image_width", result.camera.width)
-    storage.write("image_height", result.camera.height)
-    storage.write("camera_matrix", result.camera.matrix)
-    storage.write("distortion_coefficients", np.zeros((1, 5)))
+    T, lens = result.T_camera_lidar, Lens.of(result)
+    storage.write("image_width", lens.camera.width)
+    storage.write("image_height", lens.camera.height)
+    storage.write("camera_matrix", lens.camera.matrix)
+    storage.write("distortion_coefficients", np.array([[lens.k1, lens.k2, 0.0, 0.0, 0.0]]))
     storage.write("rvec", np.asarray(gtsam.Rot3.Logmap(T.rotation())).reshape(3, 1))
     storage.write("tvec", np.asarray(T.translation()).reshape(3, 1))
     storage.write("T_camera_lidar", np.ascontiguousarray(T.matrix()))
@@ -96,7 +102,7 @@ def nuscenes(rig: Rig) -> str:
     for name, result in rig.cameras.items():
         direction = f"camera, optical frame: {OPTICAL_AXES}; p_{ego} = T * p_sensor"
         own = {
-            "camera_intrinsic": result.camera.matrix.tolist(),
+            "camera_intrinsic": Lens.of(result).camera.matrix.tolist(),
             "time_offset_s": result.time_offset_s,
         }
         said = "; ".join([direction, *heading(result, name)])

@@ -17,11 +17,14 @@ from calibrations import CAMERA, FORWARD, OPTICAL_FROM_LINK, matrix_of, result_o
 from pyquaternion import Quaternion
 from scipy.spatial.transform import Rotation
 
+from sst_graph.assumptions import ASSUMPTIONS
+from sst_graph.assumptions.model import Scene
 from sst_graph.cli.options import EXPORTS
 from sst_graph.data.kitti.calib import read_calibration
 from sst_graph.errors import ConfigError
 from sst_graph.export import FORMATS, ExportOptions, export_text
 from sst_graph.result import CalibrationResult, DriveOffset
+from sst_graph.types import FloatArray
 
 
 @pytest.fixture(params=range(8))
@@ -161,6 +164,64 @@ def test_opencv(result: CalibrationResult) -> None:
     T = storage.getNode("T_camera_lidar").mat()
     np.testing.assert_allclose(T, result.T_camera_lidar.matrix(), atol=1e-15)
     np.testing.assert_allclose(values["covariance"], result.covariance)
+
+
+ESTIMATED = {"focal": -0.0056, "cx": 1.5, "k1": 0.016, "k2": -0.004}
+
+
+def with_lens(values: dict[str, float]) -> CalibrationResult:
+    """A result with parameters of the lens that were estimated with it."""
+    found = {name: {"value": value, "sigma": 1e-3} for name, value in values.items()}
+    return dataclasses.replace(result_of(FORWARD, [0.01, -0.08, -0.27]), diagnostics={"estimated": found})
+
+
+def _opencv_lens(result: CalibrationResult) -> tuple[FloatArray, FloatArray]:
+    storage = cv2.FileStorage(export_text(result, "opencv"), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    return storage.getNode("camera_matrix").mat(), storage.getNode("distortion_coefficients").mat()
+
+
+def test_an_estimated_lens_is_that_of_the_graph() -> None:
+    """Points projected by OpenCV fall where the assumptions' columns move them."""
+    result = with_lens(ESTIMATED)
+    K, distortion = _opencv_lens(result)
+    points = np.random.default_rng(3).uniform([-0.8, -0.25, 1.0], [0.8, 0.25, 1.0], (50, 3))
+    by_opencv = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, distortion)[0].reshape(-1, 2)
+    uvs = CAMERA.project(points)
+    view = Scene(CAMERA, np.zeros(6), 0.0, 0.1).view(points, np.zeros(50), uvs)
+    for name, value in ESTIMATED.items():
+        shift = ASSUMPTIONS[name].effect(view).pixel_shift
+        assert shift is not None
+        uvs = uvs + value * shift
+    np.testing.assert_allclose(by_opencv, uvs, atol=1e-9)
+    assert np.abs(by_opencv - CAMERA.project(points)).max() > 2.0
+
+
+def test_every_format_says_or_holds_the_estimated_lens(caplog: pytest.LogCaptureFixture) -> None:
+    result = with_lens(ESTIMATED)
+    K, distortion = _opencv_lens(result)
+    said = "the pose belongs to the lens estimated with it (focal, cx, k1, k2): fx 696.08"
+    for name in FORMATS.keys() - {"kitti", "gtsam"}:
+        assert said in export_text(result, name), name
+        assert said not in export_text(with_lens({}), name), name
+    cam = yaml.safe_load(export_text(result, "kalibr"))["cam0"]
+    np.testing.assert_allclose(cam["intrinsics"], [K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
+    np.testing.assert_allclose(cam["distortion_coeffs"], distortion.reshape(-1)[:4])
+    assert "no distortion" not in export_text(result, "kalibr")
+    sensors = json.loads(export_text(result, "nuscenes"))
+    np.testing.assert_allclose(sensors[1]["camera_intrinsic"], K)
+    # KITTI's P lines hold the pinhole, and no comment.
+    caplog.clear()
+    P2 = export_text(with_lens({"focal": 0.01}), "kitti").splitlines()[2]
+    assert not caplog.records
+    np.testing.assert_allclose(float(P2.split()[1]), 707.0)
+    export_text(result, "kitti")
+    assert said in caplog.text
+
+
+@pytest.mark.parametrize("odd", [3, {"focal": 3}, {"focal": {"value": "x"}}, {"focal": {"value": -1.5}}])
+def test_a_lens_that_is_none_is_not_exported(odd: Any) -> None:
+    result = dataclasses.replace(with_lens({}), diagnostics={"estimated": odd})
+    assert export_text(result, "opencv") == export_text(with_lens({}), "opencv")
 
 
 def _transform_matrix(record: dict[str, Any]) -> np.ndarray:
