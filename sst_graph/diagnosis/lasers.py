@@ -65,7 +65,8 @@ def other_axes(drives: Sequence[Drive]) -> Finding | None:
     return Finding(
         "the clouds are not in the axes of the LiDAR but in others, such as the vehicle's",
         f"seen from {place} m in them the LiDAR's rings stand out, not from their origin",
-        f"say where the LiDAR is in them, as --lidar-pose={pose} (better from tf or a drawing)",
+        f"say where the LiDAR is in them, as --lidar-pose={pose} (better from tf or a drawing); where a pose "
+        "was given, that one is wrong: leave it out, or take the product of both",
     )
 
 
