@@ -9,6 +9,7 @@ import cv2
 import gtsam
 import numpy as np
 import pytest
+from layouts import as_folder
 
 from sst_graph.cli import main
 from sst_graph.factors.camera import PinholeCamera
@@ -96,6 +97,20 @@ def test_evaluate_against_the_data_set(
     assert main(["evaluate", str(result_file), "--truth", str(data), "--json"]) == 0
     captured = capsys.readouterr()
     assert json.loads(captured.out)["atd_m"] == pytest.approx(0.0) and "reference" not in captured.err
+
+
+def test_evaluate_against_data_with_no_more_than_a_start(
+    result_file: Path, kitti_drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = as_folder(kitti_drive, tmp_path / "street")
+    assert main(["evaluate", str(result_file), "--truth", str(folder), "--json"]) == 0
+    captured = capsys.readouterr()
+    values = json.loads(captured.out)
+    assert values["atd_m"] == pytest.approx(0.01) and values["time_offset_s"] is None
+    assert "the start that the data bring, not with a reference" in captured.err
+    (folder / "extrinsic.yaml").unlink()
+    assert main(["evaluate", str(result_file), "--truth", str(folder)]) == 2
+    assert "found data without a calibration" in capsys.readouterr().err
 
 
 def test_evaluate_against_a_folder_that_holds_no_data(

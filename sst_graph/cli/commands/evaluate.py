@@ -32,7 +32,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _truth(args: argparse.Namespace, result: CalibrationResult) -> GroundTruth:
-    """The truth in a file, or that of a data set, read as the drives of the result were.
+    """The truth in a file, or that of a data set, read as the drives of the result were; where the data say
+    no more, their start.
 
     Raises:
         DataError: a file or data that cannot be read, or that bring none.
@@ -41,7 +42,12 @@ def _truth(args: argparse.Namespace, result: CalibrationResult) -> GroundTruth:
         nothing_given = argparse.Namespace(**dict.fromkeys(SOURCE_DEFAULTS))
         source = open_drive_of(nothing_given, args.truth, result, args.result)
         if source.truth is None:
-            raise DataError(args.truth, "data without a calibration", "a groundtruth.json or the like")
+            if source.nominal is None:
+                raise DataError(args.truth, "data without a calibration", "a groundtruth.json or the like")
+            complain(
+                f"note: {source.name}: compared with the start that the data bring, not with a reference"
+            )
+            return GroundTruth(source.nominal, None)
         if getattr(source, "truth_is_reference", False):
             complain(f"note: {source.name}: {OWN_CALIBRATION}")
         return source.truth
