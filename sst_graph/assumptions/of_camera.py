@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 
 from sst_graph.assumptions.model import Assumption, Effect, View
+from sst_graph.cameras.estimated_camera import squared_radius
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.types import FloatArray
 
@@ -77,18 +78,11 @@ CY = replace(
 )
 
 
-_IN_VIEW = 1.5
-"""Points farther from the axis than this many times the image's corners are not distorted further: out there
-a polynomial turns round, and would lay points from beside the image into it."""
-
-
 def _radial(view: View, power: int) -> Effect:
     """uv = c + f (x, y) (1 + k1 r^2 + k2 r^4), r^2 = x^2 + y^2 (Brown 1971; OpenCV's k1 and k2)."""
     rays, camera = view.rays, view.camera
-    focal, size = np.array([camera.fx, camera.fy]), np.array([camera.width, camera.height])
-    corner = np.maximum(view.centre, size - 1.0 - view.centre) / focal
-    square = np.minimum((rays**2).sum(axis=1, keepdims=True), _IN_VIEW**2 * (corner**2).sum())
-    return Effect(pixel_shift=focal * rays * square**power)
+    square = squared_radius(camera, rays)
+    return Effect(pixel_shift=np.array([camera.fx, camera.fy]) * rays * square**power)
 
 
 def _k1(view: View) -> Effect:

@@ -13,6 +13,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.cameras.estimated_camera import EstimatedCamera
 from sst_graph.cli.drive_odometry import DriveOdometry
 from sst_graph.data.frame_parts import RecentReader, image_positions, scan_positions
 from sst_graph.errors import DataError, count_of
@@ -102,8 +103,9 @@ def overlay(shown: ShownFrame, result: CalibrationResult, before: Placement | No
         DataError: the frame lacks its scan or its image.
     """
     camera, c_twist = shown.source.camera, shown.c_twist
+    own = EstimatedCamera.of(result) if result.camera == camera else camera
     caption = "after (image closest in time)" if shown.other_image else "after"
-    after = draw_overlay(shown.frame, camera, result.T_camera_lidar, shown.time_offset_s, c_twist, caption)
+    after = draw_overlay(shown.frame, own, result.T_camera_lidar, shown.time_offset_s, c_twist, caption)
     if before is None:
         return after
     start = shown.own, camera, before.cTl, before.time_offset_s, c_twist, before.caption

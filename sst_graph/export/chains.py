@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import gtsam
 
+from sst_graph.cameras.estimated_camera import EstimatedCamera
 from sst_graph.errors import ConfigError
 from sst_graph.export.frames import OPTICAL_AXES, Rig
-from sst_graph.export.lens import Lens
 from sst_graph.export.text import hashed, heading, number, numbers, yaml_rows, yaml_text
 from sst_graph.result import CalibrationResult
 
@@ -93,13 +93,13 @@ def _words(rig: Rig, imu: str) -> list[str]:
 
 
 def _of_lenses(rig: Rig) -> list[str]:
-    distorted = any(Lens.of(result).distorts for result in rig.cameras.values())
+    distorted = any(EstimatedCamera.of(result).distorts for result in rig.cameras.values())
     return [] if distorted else ["the images are rectified: no distortion"]
 
 
 def _intrinsics(result: CalibrationResult, topic: str, pinhole: bool) -> str:
-    lens = Lens.of(result)
-    camera, distortion = lens.camera, ", ".join(numbers([lens.k1, lens.k2, 0.0, 0.0]))
+    camera = EstimatedCamera.of(result)
+    distortion = ", ".join(numbers([camera.k1, camera.k2, 0.0, 0.0]))
     values = ", ".join(numbers([camera.fx, camera.fy, camera.cx, camera.cy]))
     return (
         ("  camera_model: pinhole\n" if pinhole else "")

@@ -13,9 +13,9 @@ import cv2
 import gtsam
 import numpy as np
 
+from sst_graph.cameras.estimated_camera import EstimatedCamera
 from sst_graph.errors import ConfigError
 from sst_graph.export.frames import OPTICAL_AXES, Rig
-from sst_graph.export.lens import Lens
 from sst_graph.export.marginal import marginal_of_result
 from sst_graph.export.text import heading, row
 from sst_graph.imports.rotations import quaternion_xyzw
@@ -31,7 +31,7 @@ def kitti(rig: Rig) -> str:
     take every line for numbers, so the file has no comments and no time offset.
     """
     result = _only(rig, "kitti", "its one Tr goes with one camera")
-    calibration, lens = rig.options.kitti, Lens.of(result)
+    calibration, lens = rig.options.kitti, EstimatedCamera.of(result)
     if lens.estimated and (lens.distorts or calibration is not None):
         _LOG.warning("--to kitti: the file does not hold this: %s", "; ".join(lens.sentences))
     if calibration is not None:
@@ -41,7 +41,7 @@ def kitti(rig: Rig) -> str:
         camera = result.camera_name.removeprefix("image_").lstrip("0") or "0"
         own = int(camera) if re.fullmatch(r"\d", camera) else 0
         # One camera is known, and stands for all: pykitti wants four.
-        P = np.hstack([lens.camera.matrix, np.zeros((3, 1))])
+        P = np.hstack([lens.matrix, np.zeros((3, 1))])
         projections = dict.fromkeys(sorted({0, 1, 2, 3, own}), P)
         c0Tl = result.T_camera_lidar
     lines = [f"P{number}: {row(matrix)}" for number, matrix in sorted(projections.items())]
@@ -73,11 +73,11 @@ def opencv(rig: Rig) -> str:
 
 
 def _write_camera(storage: cv2.FileStorage, result: CalibrationResult) -> None:
-    T, lens = result.T_camera_lidar, Lens.of(result)
-    storage.write("image_width", lens.camera.width)
-    storage.write("image_height", lens.camera.height)
-    storage.write("camera_matrix", lens.camera.matrix)
-    storage.write("distortion_coefficients", np.array([[lens.k1, lens.k2, 0.0, 0.0, 0.0]]))
+    T, camera = result.T_camera_lidar, EstimatedCamera.of(result)
+    storage.write("image_width", camera.width)
+    storage.write("image_height", camera.height)
+    storage.write("camera_matrix", camera.matrix)
+    storage.write("distortion_coefficients", np.array([[camera.k1, camera.k2, 0.0, 0.0, 0.0]]))
     storage.write("rvec", np.asarray(gtsam.Rot3.Logmap(T.rotation())).reshape(3, 1))
     storage.write("tvec", np.asarray(T.translation()).reshape(3, 1))
     storage.write("T_camera_lidar", np.ascontiguousarray(T.matrix()))
@@ -102,7 +102,7 @@ def nuscenes(rig: Rig) -> str:
     for name, result in rig.cameras.items():
         direction = f"camera, optical frame: {OPTICAL_AXES}; p_{ego} = T * p_sensor"
         own = {
-            "camera_intrinsic": Lens.of(result).camera.matrix.tolist(),
+            "camera_intrinsic": EstimatedCamera.of(result).matrix.tolist(),
             "time_offset_s": result.time_offset_s,
         }
         said = "; ".join([direction, *heading(result, name)])

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sst_graph.export.lens import Lens
+from sst_graph.cameras.estimated_camera import EstimatedCamera
 from sst_graph.imports.frames import TIME_OFFSET_SENTENCE
 from sst_graph.result import CalibrationResult
 
@@ -59,7 +59,7 @@ def heading(result: CalibrationResult, frame: str) -> list[str]:
         TIME_OFFSET_SENTENCE.format(frame=frame, value=number(result.time_offset_s)),
         f"one sigma, about and along the LiDAR's axes: rotation {rx:.3g} {ry:.3g} {rz:.3g} deg, "
         f"translation {x:.3g} {y:.3g} {z:.3g} cm, offset {sigmas.time_offset_ms:.3g} ms",
-        *Lens.of(result).sentences,
+        *EstimatedCamera.of(result).sentences,
     ]
     if result.status != "ok":
         lines.append(f"STATUS {result.status}: these numbers are not to be trusted")

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.assumptions.model import Scene
+from sst_graph.cameras.estimated_camera import EstimatedCamera
 from sst_graph.cli.options import EXPORTS
 from sst_graph.data.kitti.calib import read_calibration
 from sst_graph.errors import ConfigError
@@ -193,6 +194,10 @@ def test_an_estimated_lens_is_that_of_the_graph() -> None:
         assert shift is not None
         uvs = uvs + value * shift
     np.testing.assert_allclose(by_opencv, uvs, atol=1e-9)
+    np.testing.assert_allclose(EstimatedCamera.of(result).project(points), uvs, atol=1e-9)
+    # Points far beside the image stay there.
+    beside = EstimatedCamera.of(with_lens({"k1": -0.3})).project(np.array([[3.0, 0.0, 1.0]]))
+    assert beside[0, 0] > CAMERA.width
     assert np.abs(by_opencv - CAMERA.project(points)).max() > 2.0
 
 
