@@ -17,7 +17,7 @@ from typing import Any
 import sst_graph
 from sst_graph.config import Settings
 
-MOST_ARGUMENTS = 6
+MOST_ARGUMENTS = 7
 
 SECTIONS: dict[str, list[str]] = {
     "Data": [

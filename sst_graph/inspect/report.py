@@ -26,11 +26,12 @@ OFFSET_SIGN = "t_lidar = t_camera_stamp + offset"
 _SENTENCES, _WIDTH = ("verdict", "sweep"), 100
 """Names of the lines that are sentences, and the letters of one line of them."""
 _WITH_LABELS = (
-    "More frames reduce matches and motion. The others are assumptions that no residual shows, such as a "
-    "principal point (cx, cy) or a distortion (k1, k2) that is off by the amount named."
+    "More frames reduce matches, motion and shifts. The others are assumptions that no residual shows, such "
+    "as a principal point (cx, cy) or a distortion (k1, k2) that is off by the amount named."
 )
 _WITHOUT_LABELS = (
-    "More objects reduce the first two lines and, in part, the fifth. The others are shared by all frames."
+    "More objects reduce matches, which objects there are and, in part, shallow upper edges. The others are "
+    "shared by all frames."
 )
 """What the parts of the sigmas mean."""
 

@@ -57,7 +57,8 @@ def add_source_options(command: argparse.ArgumentParser, several_cameras: bool =
         "--image-shift",
         type=int,
         metavar="N",
-        help="pair scan k with image k+N, stamped as if it were image k: an offset of N frame times",
+        help="image k+N gets the stamp of image k, which adds N periods of the camera to the true time "
+        "offset",
     )
     source.add_argument(
         "--label-encoding",
