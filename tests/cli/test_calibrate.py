@@ -6,6 +6,7 @@ import html
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,10 @@ from stored import written
 
 from sst_graph.cli import main
 from sst_graph.cli.commands.demo import MAX_ROTATION_DEG, over_bounds
+from sst_graph.cli.inputs import starting_point
+from sst_graph.data import open_source
+from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.errors import ConfigError
 from sst_graph.inspect.reasons import MOST_REASONS, short_reasons
 from sst_graph.metrics import CalibrationErrors
 from sst_graph.result import read_result
@@ -176,6 +181,35 @@ def test_bad_options(
     assert captured.out == "" and captured.err.count("\n") == 1
     assert message in captured.err
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", ["calibrate", "track"])
+def test_a_start_in_milliseconds_is_refused(
+    street: Path, result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    document = json.loads(result.read_text())
+    start = tmp_path / "start.json"
+    start.write_text(json.dumps({"T_camera_lidar": document["T_camera_lidar"], "time_offset_s": 50.6}))
+    arguments = [command, str(street), "--init", str(start), "--out", str(tmp_path / "out")]
+    assert main(arguments) == 2
+    assert re.search(
+        r"start's time offset, 50\.6 s, is longer than the drive \(\d\.\d\d s\): is it in milliseconds\?",
+        capsys.readouterr().err,
+    )
+
+
+def test_an_offset_of_a_single_frame_or_between_two_clocks_is_taken(
+    street: Path, result: Path, tmp_path: Path
+) -> None:
+    document = json.loads(result.read_text())
+    start = tmp_path / "start.json"
+    start.write_text(json.dumps({"T_camera_lidar": document["T_camera_lidar"], "time_offset_s": 3600.0}))
+    drive = KeptDrive.of(open_source(street, frames="0:3"))
+    assert starting_point(str(start), drive[:1], "image_2")[1] == 3600.0
+    an_hour_behind = drive.with_images(lambda one: replace(one, stamp_ns=one.stamp_ns - 3600 * 10**9))
+    assert starting_point(str(start), an_hour_behind, "image_2")[1] == 3600.0
+    with pytest.raises(ConfigError, match="longer than the drive"):
+        starting_point(str(start), drive, "image_2")
 
 
 def test_classes_of_a_drive_without_labels_are_reported(
