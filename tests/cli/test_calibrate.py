@@ -212,14 +212,38 @@ def test_an_offset_of_a_single_frame_or_between_two_clocks_is_taken(
         starting_point(str(start), drive, "image_2")
 
 
+def _without(street: Path, root: Path, *names: str) -> None:
+    """The drive without some of its folders."""
+    bare = root / "sequences/00"
+    bare.mkdir(parents=True)
+    for entry in (street / "sequences/00").iterdir():
+        if entry.name not in names:
+            (bare / entry.name).symlink_to(entry)
+
+
+@pytest.mark.parametrize(
+    ("folder", "method", "missing"),
+    [("labels", "joint", "labels of points"), ("semantic_2", "paper", "semantic masks of images")],
+)
+def test_a_method_by_labels_is_refused_where_there_are_none(
+    street: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    folder: str,
+    method: str,
+    missing: str,
+) -> None:
+    _without(street, tmp_path / "drive", folder)
+    assert _calibrate(tmp_path / "drive", tmp_path / "result", "--method", method) == 2
+    said = f"drive/00: found no {missing}, expected both for method {method}: say where they are"
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "result").exists()
+
+
 def test_classes_of_a_drive_without_labels_are_reported(
     street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bare = tmp_path / "drive/sequences/00"
-    bare.mkdir(parents=True)
-    for entry in (street / "sequences/00").iterdir():
-        if entry.name not in ("labels", "semantic_2"):
-            (bare / entry.name).symlink_to(entry)
+    _without(street, tmp_path / "drive", "labels", "semantic_2")
     options = ["--classes", "vehicle", "--init", "none", "--frames", "0:2", "--no-report"]
     assert _calibrate(tmp_path / "drive", tmp_path / "result", *options) == 3
     assert "note: --classes vehicle: without labels method edges is used" in capsys.readouterr().err
