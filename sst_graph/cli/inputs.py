@@ -14,8 +14,10 @@ from sst_graph.cli.messages import complain
 from sst_graph.cli.reading import open_drive
 from sst_graph.config import read_config, with_overrides
 from sst_graph.data.info.facts import facts_of, spans_of
-from sst_graph.errors import ConfigError
+from sst_graph.data.source import is_result, recognized
+from sst_graph.errors import ConfigError, DataError
 from sst_graph.imports import ImportOptions, import_calibration
+from sst_graph.result import CalibrationResult, read_result
 from sst_graph.timestamps import NS_PER_S, apart_s
 from sst_graph.types import SemanticClass, Source
 
@@ -93,6 +95,26 @@ def _refuse_beyond_drive(choice: str, time_offset_s: float, source: Source) -> N
         f"--init {choice}: the start's time offset, {time_offset_s:.4g} s, is longer than the drive "
         f"({drive_s:.2f} s): is it in milliseconds? Expected seconds"
     )
+
+
+def given_result(path: Path) -> CalibrationResult:
+    """The result at a path (:func:`sst_graph.result.read_result`).
+
+    Raises:
+        DataError: there is none that can be read.
+    """
+    refuse_drive(path)
+    return read_result(path)
+
+
+def refuse_drive(path: Path) -> None:
+    """Refuse a drive where a result is expected.
+
+    Raises:
+        DataError: it is one.
+    """
+    if path.exists() and not is_result(path) and (kind := recognized(path)) is not None:
+        raise DataError(path, f"a drive ({kind})", "a result: calibrate it first")
 
 
 def settings(default: T, args: argparse.Namespace, flags: dict[str, Any]) -> T:

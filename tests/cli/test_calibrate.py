@@ -292,6 +292,33 @@ def test_each_drive_has_pictures_of_its_own(street: Path, tmp_path: Path) -> Non
     assert {path.name for path in out.glob("overlay_*")} == {*listed}
 
 
+@pytest.mark.parametrize("command", ["calibrate", "info"])
+def test_a_result_is_no_drive(
+    street: Path, result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    document = json.loads(result.read_text()) | {"frames_used": [{"drive": "street/00", "frame": 3}]}
+    folder = tmp_path / "result"
+    folder.mkdir()
+    (folder / "calibration.json").write_text(json.dumps(document))
+    options = ["--out", str(tmp_path / "out")] if command == "calibrate" else []
+    for place in (folder, folder / "calibration.json"):
+        assert main([command, str(place), *options]) == 2
+        said = f"{place}: found a result of sst-graph (made of street/00), expected a drive"
+        assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["inspect", "evaluate", "export"])
+def test_a_drive_is_no_result(street: Path, capsys: pytest.CaptureFixture[str], command: str) -> None:
+    options = {
+        "inspect": [],
+        "evaluate": ["--truth", str(street / "sequences/00/groundtruth.json")],
+        "export": ["--to", "kitti"],
+    }
+    assert main([command, str(street), *options[command]]) == 2
+    said = f"{street}: found a drive (kitti), expected a result: calibrate it first"
+    assert said in capsys.readouterr().err
+
+
 def test_no_data(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert _calibrate(tmp_path / "nothing", tmp_path / "result") == 2
     assert "nothing: found no file or folder" in capsys.readouterr().err
