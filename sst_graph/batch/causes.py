@@ -6,6 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from sst_graph.assumptions import held_at_zero
+from sst_graph.batch.by_edges.inverted import inverted_start
+from sst_graph.batch.by_edges.label_parts import split_by_labels
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.diagnosis import (
@@ -65,6 +67,10 @@ def with_causes(
         causes = [] if camera is None else [camera.sentence]
     if not causes and config.find_causes and config.method == "joint":
         causes = [finding.sentence for finding in _fault_hypotheses(result, drives, guess, config)]
+    if not causes and config.find_causes and result.status != "ok" and config.method in ("edges", "both"):
+        by_edges = drives if config.method == "edges" else split_by_labels(drives)[1]
+        inverted = inverted_start(by_edges, guess, config)
+        causes = [] if inverted is None else [inverted.sentence]
     if estimated:
         remarks = (remark.sentence for remark in _remarks(result, drives, config))
         result = replace(result, reasons=(*result.reasons, *remarks))
