@@ -112,7 +112,8 @@ def checked_image(image: object, camera: PinholeCamera, place: str = "image") ->
         raise DataError(place, f"a {type(image).__name__}", "a CameraImage")
     stamp_ns = checked_stamp(image.stamp_ns, place)
     size = (camera.height, camera.width)
-    for what, array in (("mask", image.mask), ("picture", image.pixels)):
+    # The picture first: a mask may have been made as large as it.
+    for what, array in (("picture", image.pixels), ("mask", image.mask)):
         _check_size(array, size, what, place)
     mask = _array(image.mask, size, f"{place}: mask", "the camera's size")
     mask = _labels(mask, f"{place}: mask")
@@ -219,7 +220,8 @@ def _check_size(array: object, size: tuple[int, int], what: str, place: str) -> 
         return
     if array.shape[:2] != size:
         (height, width), (h, w) = size, array.shape[:2]
-        expected = f"{width}x{height} px, the camera's size: make masks at the pictures' full size"
+        remedy = "all of a drive have it" if what == "picture" else "make masks at the pictures' full size"
+        expected = f"{width}x{height} px, the camera's size: {remedy}"
         raise DataError(place, f"a {what} of {w}x{h} px", expected)
 
 

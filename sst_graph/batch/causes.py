@@ -6,12 +6,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from sst_graph.assumptions import held_at_zero
+from sst_graph.batch.by_edges.inverted import inverted_start
+from sst_graph.batch.by_edges.label_parts import split_by_labels
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.diagnosis import (
     Finding,
     Fitter,
     LabelFit,
+    few_labelled,
     likely_causes,
     mirror,
     other_axes,
@@ -41,6 +44,8 @@ from sst_graph.types import Guess
 _AGREED = 0.3
 """Share of the outlines that meet, times that of close matches, above which no mirror is looked for: mirrored
 streets have 0.1 to 0.2."""
+_MOSTLY_LABELLED = 0.9
+"""Share of the frames with labels of both sensors above which the others would add little."""
 _SCANS, _CANDIDATES = 6, 160
 """Scans and candidates of the search in a comparison: one that agrees need not be exact."""
 
@@ -62,19 +67,36 @@ def with_causes(
         causes = [] if camera is None else [camera.sentence]
     if not causes and config.find_causes and config.method == "joint":
         causes = [finding.sentence for finding in _fault_hypotheses(result, drives, guess, config)]
+    if not causes and config.find_causes and result.status != "ok" and config.method in ("edges", "both"):
+        by_edges = drives if config.method == "edges" else split_by_labels(drives)[1]
+        inverted = inverted_start(by_edges, guess, config)
+        causes = [] if inverted is None else [inverted.sentence]
     if estimated:
         remarks = (remark.sentence for remark in _remarks(result, drives, config))
         result = replace(result, reasons=(*result.reasons, *remarks))
-    if not causes:
-        return result
-    status = "not_converged" if estimated else result.status
-    return replace(result, status=status, reasons=(*causes, *result.reasons))
+    if causes:
+        status = "not_converged" if estimated else result.status
+        result = replace(result, status=status, reasons=(*causes, *result.reasons))
+    return _with_unlabelled_frames(result, drives, config)
 
 
 def _wrong_sweeps(drives: Sequence[Drive]) -> list[str]:
     """A sentence for each drive whose scans contradict what was said of their sweep."""
     sweeps = [(drive.name, drive.sweep) for drive in drives if drive.sweep is not None]
     return [f"{name}: {sweep.contradiction}" for name, sweep in sweeps if sweep.contradiction]
+
+
+def _with_unlabelled_frames(
+    result: CalibrationResult, drives: Sequence[Drive], config: CalibrationConfig
+) -> CalibrationResult:
+    """The result with frames that it leaves out and method both would use; the same where it is ok, for edges
+    may make the answer of good labels worse. It is the second reason: a terminal shows the first of many."""
+    if result.status == "ok" or config.method != "joint" or config.time_offset_per_drive:
+        return result
+    found = few_labelled(drives, result.time_offset_s, _MOSTLY_LABELLED)
+    if found is None:
+        return result
+    return replace(result, reasons=(*result.reasons[:1], found.sentence, *result.reasons[1:]))
 
 
 def _remarks(

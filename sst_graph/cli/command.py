@@ -62,12 +62,24 @@ def run(argv: Sequence[str], own_process: bool = False, tells_apart: bool = Fals
     except Exception as error:
         if not own_process:
             raise
+        from sst_graph.data.source import loader_behind  # help and usage do without the readers
+
+        of_loader = loader_behind(error)
+        if of_loader is not None:
+            _LOG.debug("where it was", exc_info=error)
+            return _failed(_in_loader(error, *of_loader), EXIT_BAD_INPUT)
         _LOG.debug("where it was", exc_info=error)
         return _failed(_unexpected(error), defect)
 
 
+def _in_loader(error: Exception, name: str, place: str) -> str:
+    """What the loader of another package did not foresee, on one line."""
+    what = " ".join(f"{type(error).__name__}: {error}".split())
+    return f"in the loader {name}: {printable(what, _LONGEST)} ({place}; --verbose shows all)"
+
+
 def _unexpected(error: Exception) -> str:
-    """What nobody foresaw, on one line: a defect of this program, or of what it was extended by."""
+    """What nobody foresaw, on one line: a defect of this program."""
     steps = traceback.extract_tb(error.__traceback__)
     where = f" at {os.path.basename(steps[-1].filename)}:{steps[-1].lineno}" if steps else ""
     what = " ".join(f"{type(error).__name__}: {error}".split())

@@ -13,9 +13,12 @@ import gtsam
 from sst_graph.cli.messages import complain
 from sst_graph.cli.reading import open_drive
 from sst_graph.config import read_config, with_overrides
-from sst_graph.data.info.facts import facts_of
-from sst_graph.errors import ConfigError
+from sst_graph.data.info.facts import facts_of, spans_of
+from sst_graph.data.source import is_result, recognized
+from sst_graph.errors import ConfigError, DataError
 from sst_graph.imports import ImportOptions, import_calibration
+from sst_graph.result import CalibrationResult, read_result
+from sst_graph.timestamps import NS_PER_S, apart_s
 from sst_graph.types import SemanticClass, Source
 
 if TYPE_CHECKING:
@@ -52,7 +55,8 @@ def starting_point(choice: str, source: Source, camera: str) -> tuple[gtsam.Pose
     """cTl (None: no guess) and time offset [s] that ``--init`` asks for.
 
     Raises:
-        ConfigError: ``dataset``, and the data bring no nominal calibration.
+        ConfigError: ``dataset``, and the data bring no nominal calibration; or an offset longer than the
+            drive.
         DataError: a file that holds none.
     """
     if choice == "none":
@@ -61,13 +65,56 @@ def starting_point(choice: str, source: Source, camera: str) -> tuple[gtsam.Pose
         start = import_calibration(Path(choice), ImportOptions(camera=camera))
         if start.format not in _SAID_BY_THEMSELVES:
             complain(f"note: --init {choice}: {start.words()}")
-        return start.cTl, start.time_offset_s or 0.0
+        time_offset_s = start.time_offset_s or 0.0
+        _refuse_beyond_drive(choice, time_offset_s, source)
+        return start.cTl, time_offset_s
     if source.nominal is None:
         facts = facts_of(source)
         why = f" ({facts.nominal})" if facts is not None and facts.nominal else ""
         found = f"{source.name} brings no nominal calibration{why}"
         raise ConfigError(f"{found}: give --init none or --init FILE")
     return source.nominal, 0.0
+
+
+def _refuse_beyond_drive(choice: str, time_offset_s: float, source: Source) -> None:
+    """Refuse an offset in the wrong unit: under it no image is of the time of a scan, without it some are.
+
+    Sensors with clocks of different epochs have longer ones; a drive of one frame has no duration.
+
+    Raises:
+        ConfigError: it is one.
+    """
+    spans = spans_of(source) if time_offset_s else None
+    if spans is None:
+        return
+    scans, images = spans
+    drive_s = (max(scans[1], images[1]) - min(scans[0], images[0])) / NS_PER_S
+    if drive_s <= 0.0 or abs(time_offset_s) <= drive_s or apart_s(scans, images) > 0.0:
+        return
+    raise ConfigError(
+        f"--init {choice}: the start's time offset, {time_offset_s:.4g} s, is longer than the drive "
+        f"({drive_s:.2f} s): is it in milliseconds? Expected seconds"
+    )
+
+
+def given_result(path: Path) -> CalibrationResult:
+    """The result at a path (:func:`sst_graph.result.read_result`).
+
+    Raises:
+        DataError: there is none that can be read.
+    """
+    refuse_drive(path)
+    return read_result(path)
+
+
+def refuse_drive(path: Path) -> None:
+    """Refuse a drive where a result is expected.
+
+    Raises:
+        DataError: it is one.
+    """
+    if path.exists() and not is_result(path) and (kind := recognized(path)) is not None:
+        raise DataError(path, f"a drive ({kind})", "a result: calibrate it first")
 
 
 def settings(default: T, args: argparse.Namespace, flags: dict[str, Any]) -> T:

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from functools import cache
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sst_graph.errors import ConfigError
-from sst_graph.types import SemanticClass, Source
+from sst_graph.data.frame_parts import image_at, image_positions, scan_at, scan_positions
+from sst_graph.errors import ConfigError, DataError
+from sst_graph.sampling import evenly_spread
+from sst_graph.types import CameraImage, Scan, SemanticClass, Source
 
 if TYPE_CHECKING:
     from sst_graph.segmentation import ImageSegmenter, Labelling, LabelStore, ScanSegmenter
 
 LABEL_OPTIONS = ("image_model", "lidar_model", "labels")
 """Options that say what labels a drive."""
+METHODS_BY_LABELS = ("joint", "paper", "static", "semalign")
+"""Methods that align nothing without labels of both sensors."""
+_FIRST = 8
+"""Scans, or images, that are looked at before all others."""
 
 
 def labelled(source: Source, options: Mapping[str, Any]) -> Source:
@@ -55,6 +61,38 @@ def check_classes(sources: Sequence[Source], classes: Sequence[SemanticClass], a
                     f"{model.name}: found no {missing[0]} among its classes ({known}), expected all that are "
                     "to be aligned (--classes)"
                 )
+
+
+def require_labels(sources: Sequence[Source], method: str) -> None:
+    """Require labels on each side for a method that aligns nothing else; those by networks are made later.
+
+    Raises:
+        DataError: no scan of any drive has labels, or no image; or a frame that cannot be read.
+    """
+    if method not in METHODS_BY_LABELS or any(getattr(one, "labelling", None) is not None for one in sources):
+        return
+    missing = []
+    if not any(_any_labels(scan_positions(one), partial(scan_at, one)) for one in sources):
+        missing.append("labels of points")
+    if not any(_any_labels(image_positions(one), partial(image_at, one)) for one in sources):
+        missing.append("semantic masks of images")
+    if missing:
+        raise DataError(
+            ", ".join(source.name for source in sources),
+            f"no {' and no '.join(missing)}",
+            f"both for method {method}: say where they are, make them by networks, or take --method edges",
+        )
+
+
+def _any_labels(positions: Sequence[int], read: Callable[[int], Scan | CameraImage | None]) -> bool:
+    """Whether a scan or image has labels; some that are spread over the drive are looked at first."""
+    order = dict.fromkeys((*evenly_spread(positions, _FIRST), *positions))
+    measured = (read(position) for position in order)
+    return any(one is not None and _has_labels(one) for one in measured)
+
+
+def _has_labels(one: Scan | CameraImage) -> bool:
+    return one.has_labels if isinstance(one, Scan) else one.has_mask
 
 
 def store_to_fill(folder: Path | None) -> LabelStore:

@@ -15,7 +15,7 @@ import numpy as np
 from sst_graph.batch import CalibrationConfig
 from sst_graph.cli import EXIT_NOT_TRUSTED
 from sst_graph.cli.inputs import calibration_settings, open_drives, starting_point
-from sst_graph.cli.labels import check_classes
+from sst_graph.cli.labels import check_classes, require_labels
 from sst_graph.cli.messages import complain, mention, say
 from sst_graph.cli.output_places import check_apart
 from sst_graph.cli.outputs import CALIBRATION, comparison, result_numbers, why_not_ok, write_calibration
@@ -133,6 +133,8 @@ def _calibrated(
     """The drives of each camera, and their calibration, with progress on stderr."""
     of_camera = {name: argparse.Namespace(**{**vars(args), "camera": name}) for name in cameras}
     sources, read_as = _opened(of_camera)
+    for own in sources.values():
+        require_labels(own, config.method)
     check_classes(next(iter(sources.values())), config.classes, args.classes)
     initial, offsets_s = _starts(args.init, sources, read_as)
     known = KnownRig(_known_poses(args.rig, sources, *sigmas), one_trigger=args.one_trigger)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
@@ -16,6 +18,7 @@ from sst_graph.errors import ConfigError, DataError
 from sst_graph.factors.arguments import described, is_whole
 from sst_graph.files.reading import path_of
 from sst_graph.files.typed_values import wrong_fields
+from sst_graph.result import CALIBRATION_NAME, RIG_NAME, read_result
 from sst_graph.sweep_timing import SweepStamp, SweepTiming
 from sst_graph.types import Source
 
@@ -225,6 +228,21 @@ def find_loader(name: str) -> Loader:
     return loader
 
 
+def loader_behind(error: BaseException) -> tuple[str, str] | None:
+    """Name of the loader of another package in whose code an exception was raised, or passed through, and the
+    file and line there; None where it was in none."""
+    modules = {entry.module: name for name, entry in _added().items()}
+    modules |= {str(getattr(loader.open, "__module__", "")): name for name, loader in _LOADERS.items()}
+    packages = {module.partition(".")[0]: name for module, name in modules.items()}
+    packages.pop(__name__.partition(".")[0], None)
+    found = None
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        name = packages.get(str(frame.f_globals.get("__name__", "")).partition(".")[0])
+        if name is not None:
+            found = name, f"{os.path.basename(frame.f_code.co_filename)}:{line}"
+    return found
+
+
 def _added() -> dict[str, EntryPoint]:
     """Loaders of installed packages by name; the names of our own are not replaced."""
     found = {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
@@ -282,10 +300,28 @@ def open_source(
     if not present:
         raise DataError(path, "no file or folder", "a drive")
     found = recognized(path)
+    if found is None and is_result(path):
+        raise DataError(path, f"a result of sst-graph{_drives_of(path)}", "a drive")
     if found is None:
         layouts = [find_loader(name).layout for name in loader_names()]
         raise DataError(path, f"no layout that is known{_content(path)}", "; or ".join(layouts))
     return find_loader(found).opened(path, chosen)
+
+
+def is_result(path: Path) -> bool:
+    """Whether a path is that of a calibration, of one camera or of several: its folder or its file."""
+    if path.is_dir():
+        return any((path / name).is_file() for name in (CALIBRATION_NAME, RIG_NAME))
+    return path.name in (CALIBRATION_NAME, RIG_NAME)
+
+
+def _drives_of(path: Path) -> str:
+    """The drives that a result was made of, in words; empty where its file does not say it."""
+    try:
+        names = dict.fromkeys(frame.drive for frame in read_result(path).frames_used)
+    except DataError:
+        return ""
+    return f" (made of {', '.join(names)})" if names else ""
 
 
 def _content(path: Path) -> str:

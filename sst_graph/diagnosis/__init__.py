@@ -11,6 +11,7 @@ from sst_graph.diagnosis.cameras import uncalibrated
 from sst_graph.diagnosis.causes import likely_causes, mirror, preflight
 from sst_graph.diagnosis.finding import Finding
 from sst_graph.diagnosis.fit import Fitter, LabelFit
+from sst_graph.diagnosis.labels import few_labelled
 from sst_graph.diagnosis.lasers import other_axes, unknown_lasers
 from sst_graph.diagnosis.poses import other_camera
 
@@ -18,6 +19,7 @@ __all__ = [
     "Finding",
     "Fitter",
     "LabelFit",
+    "few_labelled",
     "likely_causes",
     "mirror",
     "other_axes",

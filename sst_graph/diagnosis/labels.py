@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from sst_graph.association.time_pairing import pair_by_time
 from sst_graph.diagnosis.finding import Finding
 from sst_graph.diagnosis.units import FLAT, usual_ground
 from sst_graph.drive.input_statistics import InputStatistics
@@ -66,6 +67,33 @@ def searched_classes(drives: Sequence[Drive], classes: Sequence[SemanticClass]) 
                     "compare the class numbers of the labels with their table, and look at an overlay",
                 )
     return None
+
+
+def few_labelled(drives: Sequence[Drive], time_offset_s: float, least: float) -> Finding | None:
+    """Frames with pictures that a method by labels leaves out: less than a share has labels of both sensors.
+
+    Args:
+        time_offset_s: under which scans and images are paired [s].
+        least: the share.
+    """
+    both, frames = 0, 0
+    for drive in drives:
+        if drive.statistics is None:
+            continue
+        scans, images = drive.statistics.scans, drive.statistics.images
+        of_scans, of_images = [scan.stamp_ns for scan in scans], [image.stamp_ns for image in images]
+        for pair in pair_by_time(of_scans, of_images, time_offset_s, drive.image_period_s):
+            scan, image = scans[pair.scan], images[pair.image]
+            labelled = all(one.labelled.keys() - {int(SemanticClass.IGNORE)} for one in (scan, image))
+            both += labelled
+            frames += labelled or image.brightest is not None
+    if not both or both >= least * frames:
+        return None
+    return Finding(
+        f"only {both} of {count_of(frames, 'frame')} have labels of both sensors",
+        f"the other {frames - both} are not used",
+        "--method both uses the others by edges",
+    )
 
 
 def ground_points(drive: Drive) -> Finding | None:

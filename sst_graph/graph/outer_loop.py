@@ -364,6 +364,7 @@ def _check_matches(matches: int, pairs: int, config: JointConfig, edges: Sequenc
     if matches >= config.min_matches:
         return
     expected = f"expected {config.min_matches} or more"
+    by_edges = {c for own in edges for c in own.classes} <= {SemanticClass.OBJECT}
     moving = _moving_share(edges)
     if moving > _MOSTLY:
         cause = (
@@ -372,13 +373,15 @@ def _check_matches(matches: int, pairs: int, config: JointConfig, edges: Sequenc
         )
     elif not matches:
         cause = (
-            ": no boundary point of a scan is near a contour of its class, or an edge of the picture, in the "
-            "image of its time"
+            ": no boundary point of a scan is near an edge of the picture of its time"
+            if by_edges
+            else ": no boundary point of a scan is near a contour of its class in the image of its time"
         )
     else:
         cause = ""
-    found = count_of(matches, "silhouette match", "silhouette matches")
-    where = f"{found} in {count_of(pairs, 'pair')} of scan and image" if matches else "no silhouette matches"
+    kind = "edge match" if by_edges else "silhouette match"
+    where = f"{count_of(matches, kind, f'{kind}es')} in {count_of(pairs, 'pair')} of scan and image"
+    where = where if matches else f"no {kind}es"
     raise EstimationError(f"{where}, {expected}{cause}")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from functools import cache
 from pathlib import Path
+from typing import cast
 
 import gtsam
 import numpy as np
@@ -14,13 +15,15 @@ from stored import simulated
 
 from sst_graph import CalibrationConfig, calibrate, open_source
 from sst_graph.batch.by_edges.choice import with_method_for
+from sst_graph.batch.by_edges.inverted import inverted_start
 from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.drive.preparation import Drive
 from sst_graph.experiments.starts import errors_of
 from sst_graph.fit import FitQuality
 from sst_graph.inspect.report import summary
 from sst_graph.inspect.verdict import quality_line
 from sst_graph.simulator import SimulationConfig
-from sst_graph.types import CameraImage, Scan, SemanticClass
+from sst_graph.types import CameraImage, Guess, Scan, SemanticClass
 from studies.edges_streets import source_of, start_step
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -65,6 +68,23 @@ def test_auto_takes_labels_where_both_sensors_have_some() -> None:
 @pytest.fixture(scope="module")
 def result():  # type: ignore[no-untyped-def]
     return calibrate(unlabelled(), unlabelled().truth.cTl.retract(AWAY))  # type: ignore[union-attr]
+
+
+def test_around_the_inverse_of_an_upright_start_nothing_is_searched() -> None:
+    nominal, no_drive = unlabelled().nominal, cast(Drive, None)
+    assert nominal is not None
+    on_its_side = gtsam.Pose3(gtsam.Rot3.Rz(1.6), np.zeros(3)) * nominal
+    for start in (nominal, on_its_side, None):
+        assert inverted_start([no_drive], Guess(start, 0.0), CalibrationConfig(method="edges")) is None
+
+
+@pytest.mark.slow
+def test_an_inverted_start_is_named() -> None:
+    nominal = unlabelled().nominal
+    assert nominal is not None
+    first, *others = calibrate(unlabelled(), nominal.inverse()).reasons
+    assert first.startswith("the start (Tr) is inverted (around its inverse edges")
+    assert any("no edge matches" in reason or "near an edge of the picture" in reason for reason in others)
 
 
 @pytest.mark.slow

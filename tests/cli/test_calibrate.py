@@ -6,6 +6,7 @@ import html
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,10 @@ from stored import written
 
 from sst_graph.cli import main
 from sst_graph.cli.commands.demo import MAX_ROTATION_DEG, over_bounds
+from sst_graph.cli.inputs import starting_point
+from sst_graph.data import open_source
+from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.errors import ConfigError
 from sst_graph.inspect.reasons import MOST_REASONS, short_reasons
 from sst_graph.metrics import CalibrationErrors
 from sst_graph.result import read_result
@@ -178,14 +183,67 @@ def test_bad_options(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("command", ["calibrate", "track"])
+def test_a_start_in_milliseconds_is_refused(
+    street: Path, result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    document = json.loads(result.read_text())
+    start = tmp_path / "start.json"
+    start.write_text(json.dumps({"T_camera_lidar": document["T_camera_lidar"], "time_offset_s": 50.6}))
+    arguments = [command, str(street), "--init", str(start), "--out", str(tmp_path / "out")]
+    assert main(arguments) == 2
+    assert re.search(
+        r"start's time offset, 50\.6 s, is longer than the drive \(\d\.\d\d s\): is it in milliseconds\?",
+        capsys.readouterr().err,
+    )
+
+
+def test_an_offset_of_a_single_frame_or_between_two_clocks_is_taken(
+    street: Path, result: Path, tmp_path: Path
+) -> None:
+    document = json.loads(result.read_text())
+    start = tmp_path / "start.json"
+    start.write_text(json.dumps({"T_camera_lidar": document["T_camera_lidar"], "time_offset_s": 3600.0}))
+    drive = KeptDrive.of(open_source(street, frames="0:3"))
+    assert starting_point(str(start), drive[:1], "image_2")[1] == 3600.0
+    an_hour_behind = drive.with_images(lambda one: replace(one, stamp_ns=one.stamp_ns - 3600 * 10**9))
+    assert starting_point(str(start), an_hour_behind, "image_2")[1] == 3600.0
+    with pytest.raises(ConfigError, match="longer than the drive"):
+        starting_point(str(start), drive, "image_2")
+
+
+def _without(street: Path, root: Path, *names: str) -> None:
+    """The drive without some of its folders."""
+    bare = root / "sequences/00"
+    bare.mkdir(parents=True)
+    for entry in (street / "sequences/00").iterdir():
+        if entry.name not in names:
+            (bare / entry.name).symlink_to(entry)
+
+
+@pytest.mark.parametrize(
+    ("folder", "method", "missing"),
+    [("labels", "joint", "labels of points"), ("semantic_2", "paper", "semantic masks of images")],
+)
+def test_a_method_by_labels_is_refused_where_there_are_none(
+    street: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    folder: str,
+    method: str,
+    missing: str,
+) -> None:
+    _without(street, tmp_path / "drive", folder)
+    assert _calibrate(tmp_path / "drive", tmp_path / "result", "--method", method) == 2
+    said = f"drive/00: found no {missing}, expected both for method {method}: say where they are"
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "result").exists()
+
+
 def test_classes_of_a_drive_without_labels_are_reported(
     street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bare = tmp_path / "drive/sequences/00"
-    bare.mkdir(parents=True)
-    for entry in (street / "sequences/00").iterdir():
-        if entry.name not in ("labels", "semantic_2"):
-            (bare / entry.name).symlink_to(entry)
+    _without(street, tmp_path / "drive", "labels", "semantic_2")
     options = ["--classes", "vehicle", "--init", "none", "--frames", "0:2", "--no-report"]
     assert _calibrate(tmp_path / "drive", tmp_path / "result", *options) == 3
     assert "note: --classes vehicle: without labels method edges is used" in capsys.readouterr().err
@@ -232,6 +290,33 @@ def test_each_drive_has_pictures_of_its_own(street: Path, tmp_path: Path) -> Non
     listed = re.findall(r"\((overlay_.*?)\)", (out / "report.md").read_text())
     assert len(listed) == len({*listed}) == len(drives)
     assert {path.name for path in out.glob("overlay_*")} == {*listed}
+
+
+@pytest.mark.parametrize("command", ["calibrate", "info"])
+def test_a_result_is_no_drive(
+    street: Path, result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    document = json.loads(result.read_text()) | {"frames_used": [{"drive": "street/00", "frame": 3}]}
+    folder = tmp_path / "result"
+    folder.mkdir()
+    (folder / "calibration.json").write_text(json.dumps(document))
+    options = ["--out", str(tmp_path / "out")] if command == "calibrate" else []
+    for place in (folder, folder / "calibration.json"):
+        assert main([command, str(place), *options]) == 2
+        said = f"{place}: found a result of sst-graph (made of street/00), expected a drive"
+        assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["inspect", "evaluate", "export"])
+def test_a_drive_is_no_result(street: Path, capsys: pytest.CaptureFixture[str], command: str) -> None:
+    options = {
+        "inspect": [],
+        "evaluate": ["--truth", str(street / "sequences/00/groundtruth.json")],
+        "export": ["--to", "kitti"],
+    }
+    assert main([command, str(street), *options[command]]) == 2
+    said = f"{street}: found a drive (kitti), expected a result: calibrate it first"
+    assert said in capsys.readouterr().err
 
 
 def test_no_data(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

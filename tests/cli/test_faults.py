@@ -69,6 +69,17 @@ sys.argv = ["sst-graph", "info", ".", "--loader", "foreign"]
 sys.exit(main())
 """
 """A reader of someone else's that fails in a way of its own."""
+OWN_DEFECT = """
+import sys
+from sst_graph.cli import main
+from sst_graph.cli.commands import info
+def run(args):
+    return {}[chr(27) + "[31m" + chr(10) + "x"]
+info.run = run
+sys.argv = ["sst-graph", "info", "."]
+sys.exit(main())
+"""
+"""A command of our own that fails so."""
 
 
 @pytest.fixture(scope="module")
@@ -248,14 +259,21 @@ def test_too_little_memory_is_one_line(tmp_path: Path) -> None:
     assert done.stderr.startswith("sst-graph: error: not enough memory")
 
 
-def test_what_nobody_foresaw_is_one_line() -> None:
+@pytest.mark.parametrize(
+    ("program", "begin", "end"),
+    [
+        (OWN_DEFECT, "unexpected KeyError: ", "at <string>:6 (a defect, please report it with what"),
+        (FOREIGN_LOADER, "in the loader foreign: KeyError: ", "(<string>:6; --verbose shows all)"),
+    ],
+)
+def test_what_nobody_foresaw_is_one_line(program: str, begin: str, end: str) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", FOREIGN_LOADER], capture_output=True, text=True, timeout=120, check=False
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False
     )
     assert done.returncode == 2 and done.stdout == ""
     line = done.stderr.removesuffix("\n")
-    assert line.isprintable() and line.startswith("sst-graph: error: unexpected KeyError: ")
-    assert "at <string>:6 (a defect, please report it with what --verbose says)" in line
+    assert line.isprintable() and line.startswith(f"sst-graph: error: {begin}")
+    assert end in line
 
 
 def test_a_name_that_the_system_refuses_is_shortened() -> None:

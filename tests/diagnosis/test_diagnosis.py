@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import cv2
 import gtsam
@@ -34,10 +35,10 @@ from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.mask_shift import contour_profiles, mask_shift
 from sst_graph.inspect.reasons import short_reason
 from sst_graph.odometry.sweep import SweepDecision, SweptSource, with_sweep
-from sst_graph.result import FrameId
+from sst_graph.result import FrameId, Status
 from sst_graph.simulator import SimulationConfig
 from sst_graph.sweep_timing import SweepTiming
-from sst_graph.types import NO_PICTURE, Guess, PixelStretch, Scan, SemanticClass, Source
+from sst_graph.types import NO_PICTURE, Frame, Guess, PixelStretch, Scan, SemanticClass, Source
 from studies.subtle_faults import SUBTLE_FAULTS, SUBTLE_NAMED, repeated_pictures
 from studies.wrong_drives import INPUT_FAULTS, NAMED, shifted_masks
 
@@ -475,6 +476,28 @@ def test_it_is_a_remark_unless_it_is_said_how_far_it_may_be_off() -> None:
     # A pinhole to which the pictures of a lens were rectified is centred by its maker, this package.
     drives = [replace(prepared, statistics=_rectified(prepared.statistics)) for prepared in drives]
     assert reasons() == ()
+
+
+def test_frames_without_labels_are_named_where_the_result_is_not_ok() -> None:
+    def bare(frame: Frame) -> Frame:
+        assert frame.scan is not None
+        nothing = np.full_like(frame.scan.classes, SemanticClass.IGNORE)
+        return replace(frame, scan=replace(frame.scan, classes=nothing))
+
+    guess = Guess(drive().nominal, 0.0)
+
+    def reasons(labelled: int, status: Status = "unobservable", **settings: Any) -> tuple[str, ...]:
+        config = CalibrationConfig(find_causes=False, **{"method": "joint", **settings})
+        frames = tuple(frame if k < labelled else bare(frame) for k, frame in enumerate(drive()))
+        drives = prepare_drives([swept(replace(drive(), frames=frames))], config)
+        found = replace(guess_as_result(drives, guess, config, "first"), reasons=("first", "second"))
+        return with_causes(replace(found, status=status), drives, guess, config).reasons
+
+    words = "only 3 of 10 frames have labels of both sensors (the other 7 are not used): --method both"
+    first, named, second = reasons(3)
+    assert (first, second) == ("first", "second") and named.startswith(words)
+    assert reasons(3, status="ok") == reasons(10) == ("first", "second")
+    assert reasons(3, time_offset_per_drive=True) == ("first", "second")
 
 
 def _rectified(statistics: InputStatistics | None) -> InputStatistics:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import tomllib
 from pathlib import Path
 
 import gtsam
@@ -256,3 +257,10 @@ def test_no_text_takes_long(text: str, tmp_path: Path) -> None:
     with pytest.raises(DataError):
         import_calibration(written(tmp_path, text))
     assert time.process_time() - began < 2.0
+
+
+def test_what_ros_users_install_reads_yaml() -> None:
+    with (Path(__file__).resolve().parents[2] / "pyproject.toml").open("rb") as stream:
+        extras = tomllib.load(stream)["project"]["optional-dependencies"]
+    for name in ("yaml", "ros"):
+        assert any(each.startswith("PyYAML") for each in extras[name]), name

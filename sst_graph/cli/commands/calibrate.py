@@ -12,7 +12,7 @@ import gtsam
 from sst_graph.batch import CalibrationConfig, calibrate
 from sst_graph.batch.by_edges.choice import with_method_for
 from sst_graph.cli.inputs import calibration_settings, open_drives, starting_point
-from sst_graph.cli.labels import check_classes
+from sst_graph.cli.labels import check_classes, require_labels
 from sst_graph.cli.messages import complain, mention, say
 from sst_graph.cli.output_places import check_apart
 from sst_graph.cli.outputs import CALIBRATION, comparison, exit_code, result_numbers, write_calibration
@@ -46,6 +46,7 @@ def run(args: argparse.Namespace) -> int:
             read_as = options_of(args)
             sources = open_drives(args)
             config = dataclasses.replace(with_method_for(config, sources), for_report=not args.no_report)
+            require_labels(sources, config.method)
             if config.method not in ("motion", "edges"):
                 check_classes(sources, config.classes, args.classes)
             elif args.classes is not None:

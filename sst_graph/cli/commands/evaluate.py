@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 import json
 
+from sst_graph.cli.inputs import given_result
 from sst_graph.cli.messages import complain, say
 from sst_graph.cli.options import SOURCE_DEFAULTS
 from sst_graph.cli.reading import open_drive_of, reading_words
@@ -13,13 +14,13 @@ from sst_graph.errors import ConfigError, DataError
 from sst_graph.inspect.report import OWN_CALIBRATION, error_lines
 from sst_graph.metrics import TruthSigma, calibration_errors
 from sst_graph.reference import read_reference
-from sst_graph.result import CalibrationResult, read_result, result_file
+from sst_graph.result import CalibrationResult, result_file
 from sst_graph.types import GroundTruth
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the errors of ``args.result`` against ``args.truth``."""
-    result = read_result(args.result)
+    result = given_result(args.result)
     truth = _truth(args, result)
     sigma = None if args.truth_sigma is None else _truth_sigma(args.truth_sigma)
     estimate = result.T_camera_lidar, result.time_offset_s

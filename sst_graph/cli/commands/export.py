@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from sst_graph.cli.inputs import refuse_drive
 from sst_graph.cli.messages import complain, loudness, mention, say
 from sst_graph.cli.output_places import check_apart
 from sst_graph.data.kitti.calib import read_calibration
@@ -67,6 +68,7 @@ def _text(args: argparse.Namespace) -> str:
 
 def _result(path: Path) -> CalibrationResult | RigResult:
     """The result of a camera, or of a rig."""
+    refuse_drive(path)
     return read_rig(path) if _file(path).name == RIG_NAME else read_result(path)
 
 

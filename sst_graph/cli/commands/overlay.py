@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from sst_graph.cli.inputs import given_result
 from sst_graph.cli.messages import mention
 from sst_graph.cli.output_places import PNG_FILE, check_apart
 from sst_graph.cli.outputs import nominal_of, start_of
@@ -17,7 +18,7 @@ from sst_graph.errors import ConfigError, count_of
 from sst_graph.files import output_file
 from sst_graph.odometry.sweep import with_sweep_of
 from sst_graph.reference import load_initial
-from sst_graph.result import CalibrationResult, read_result, result_file
+from sst_graph.result import CalibrationResult, result_file
 from sst_graph.types import Source
 from sst_graph.viz import Placement
 from sst_graph.viz.video import check_video_name
@@ -63,7 +64,7 @@ def _write_video(args: argparse.Namespace) -> int:
 
 def _read(args: argparse.Namespace) -> tuple[CalibrationResult, Source, Placement | None]:
     """The result, its drive, and what it is compared with."""
-    result = read_result(args.result)
+    result = given_result(args.result)
     source = with_sweep_of(open_drive_of(args, args.data, result, args.result), result.diagnostics)
     return result, source, _before(args.before, result, source)
 

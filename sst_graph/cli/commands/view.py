@@ -8,7 +8,7 @@ from contextlib import ExitStack
 import numpy as np
 
 from sst_graph.batch import CalibrationConfig
-from sst_graph.cli.inputs import chosen_classes
+from sst_graph.cli.inputs import chosen_classes, given_result
 from sst_graph.cli.messages import mention
 from sst_graph.cli.output_places import RERUN_FILE, check_apart
 from sst_graph.cli.pictures import offset_of
@@ -18,7 +18,7 @@ from sst_graph.errors import ConfigError, count_of
 from sst_graph.files import output_file
 from sst_graph.inspect.inspection import inspect_result
 from sst_graph.odometry.sweep import with_sweep_of
-from sst_graph.result import CalibrationResult, read_result, result_file
+from sst_graph.result import CalibrationResult, result_file
 from sst_graph.types import SemanticClass, Source
 from sst_graph.viewer import Recording, rerun
 from sst_graph.viewer.fixed_calibration import views_under
@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
         out = None
         if args.save is not None:
             out = outputs.enter_context(output_file(args.save, args.overwrite, RERUN_FILE))
-        result = read_result(args.result)
+        result = given_result(args.result)
         source = with_sweep_of(open_drive_of(args, args.data, result, args.result), result.diagnostics)
         place = None if out is None else out.partial
         with Recording(source.camera, live=out is None, save=place, tracked=False) as recording:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.data.frame_parts import image_at, image_positions, scan_at, scan_positions
+from sst_graph.timestamps import Span
 from sst_graph.types import Source
 
 
@@ -47,3 +50,23 @@ def facts_of(source: Source) -> SourceFacts | None:
     """
     reader = getattr(source, "facts", None)
     return reader() if callable(reader) else None
+
+
+def spans_of(source: Source) -> tuple[Span, Span] | None:
+    """First and last stamp of the scans and of the images; None where a sensor has no frame.
+
+    Raises:
+        DataError: one of them cannot be read.
+    """
+    facts = facts_of(source)
+    if facts is not None:
+        scans, images = facts.scan.stamps_ns.tolist(), facts.image.stamps_ns.tolist()
+    else:
+        of_scans, of_images = _ends(scan_positions(source)), _ends(image_positions(source))
+        scans = [scan.stamp_ns for k in of_scans if (scan := scan_at(source, k)) is not None]
+        images = [image.stamp_ns for k in of_images if (image := image_at(source, k)) is not None]
+    return ((scans[0], scans[-1]), (images[0], images[-1])) if scans and images else None
+
+
+def _ends(positions: Sequence[int]) -> list[int]:
+    return [positions[0], positions[-1]] if positions else []

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-_BY_LABELS = ("joint", "paper", "semalign")
+_BY_LABELS = ("joint", "both", "paper", "semalign")
 _BY_MOTION = ("motion",)
-_BY_PICTURES = ("edges", "motion", "paper")
+_BY_PICTURES = ("edges", "both", "motion", "paper")
 _NO_SEARCH = ("paper", "semalign")
 """Methods that start from a given pose alone."""
-METHODS = ("joint", "edges", "motion", "paper", "semalign", "track")
+METHODS = ("joint", "edges", "both", "motion", "paper", "semalign", "track")
 
 
 @dataclass(frozen=True)

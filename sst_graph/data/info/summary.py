@@ -61,6 +61,7 @@ class ScanInfo:
     """Scans that were looked at.
 
     Attributes:
+        looked_at: their number.
         points: of a scan, the median.
         left_out: points that were NaN or inf, of all of them.
         labelled_scans, labelled_points: share of scans with labels, of points with a label.
@@ -69,6 +70,7 @@ class ScanInfo:
         rings: laser numbers in a scan; 0 where they are not known.
     """
 
+    looked_at: int
     points: int
     left_out: int
     labelled_scans: float
@@ -83,11 +85,13 @@ class ImageInfo:
     """Images that were looked at.
 
     Attributes:
+        looked_at: their number.
         pictures, masks: share of images with a picture, with a mask.
         labelled_pixels: share of pixels with a label.
         classes: that can be aligned.
     """
 
+    looked_at: int
     pictures: float
     masks: float
     labelled_pixels: float
@@ -224,6 +228,7 @@ def _scan_info(scans: Sequence[Scan]) -> ScanInfo | None:
     classes = np.concatenate([scan.classes for scan in scans])
     spans = [float(np.ptp(s.offsets_s)) for s in scans if s.offsets_s is not None and len(s.offsets_s)]
     return ScanInfo(
+        looked_at=len(scans),
         points=int(np.median([len(scan.points) for scan in scans])),
         left_out=sum(scan.left_out for scan in scans),
         labelled_scans=float(np.mean([scan.has_labels for scan in scans])),
@@ -239,6 +244,7 @@ def _image_info(images: Sequence[CameraImage]) -> ImageInfo | None:
         return None
     classes = np.concatenate([image.mask.ravel() for image in images])
     return ImageInfo(
+        looked_at=len(images),
         pictures=float(np.mean([image.has_picture for image in images])),
         masks=float(np.mean([image.has_mask for image in images])),
         labelled_pixels=_labelled(classes),

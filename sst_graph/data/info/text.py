@@ -75,19 +75,26 @@ def _rate(hz: float) -> str:
 def _masks(images: ImageInfo) -> str:
     if not images.masks:
         return "no masks"
-    share, pixels = _share(images.masks), _share(images.labelled_pixels)
-    return f"masks of {share} of the images, {pixels} of all pixels: {_classes(images.classes)}"
+    share, pixels = _share_of(images.masks, images.looked_at, "image"), _share(images.labelled_pixels)
+    return f"masks of {share}, {pixels} of all pixels: {_classes(images.classes)}"
 
 
 def _points(scans: ScanInfo) -> str:
     if not scans.labelled_scans:
         return "no labels of points"
-    share, points = _share(scans.labelled_scans), _share(scans.labelled_points)
-    return f"labels in {share} of the scans, {points} of all points: {_classes(scans.classes)}"
+    share, points = _share_of(scans.labelled_scans, scans.looked_at, "scan"), _share(scans.labelled_points)
+    return f"labels in {share}, {points} of all points: {_classes(scans.classes)}"
 
 
 def _classes(names: Sequence[str]) -> str:
     return ", ".join(names) or "none that can be aligned"
+
+
+def _share_of(share: float, looked_at: int, what: str) -> str:
+    """All or none of the scans or images; or how many of those that were looked at, which are few."""
+    if share in (0.0, 1.0):
+        return f"{_share(share)} of the {what}s"
+    return f"{round(share * looked_at)} of {count_of(looked_at, what)} looked at"
 
 
 def _share(share: float) -> str:

@@ -61,7 +61,12 @@ def test_pictures_of_12_bits_in_16_are_missing_pictures(kitti_drive: Path) -> No
         cv2.imwrite(str(path), np.full((6, 8), 4095, np.uint16))
     found = drive_info(open_source(kitti_drive)).missing
     words = "pictures that are not black (12 bits kept in 16 are to be made 16 times brighter)"
-    assert {method for method, missing in found.items() if words in missing} == {"edges", "motion", "paper"}
+    assert {method for method, missing in found.items() if words in missing} == {
+        "edges",
+        "both",
+        "motion",
+        "paper",
+    }
 
 
 def test_text_and_json_of_a_drive(kitti_drive: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -87,6 +92,17 @@ def test_a_drive_without_labels(kitti_drive: Path, capsys: pytest.CaptureFixture
     found = json.loads(capsys.readouterr().out)
     assert found["scans"]["labelled_points"] == 0.0
     assert found["missing"]["motion"] == [] and found["missing"]["joint"] == ["labels of points"]
+
+
+def test_labels_of_some_frames_are_counted_where_they_were_looked_at(
+    kitti_drive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for k in range(1, 5):
+        np.zeros(12, "<u4").tofile(kitti_drive / f"labels/{k:06d}.label")
+    assert main(["info", str(kitti_drive)]) == 0
+    said = capsys.readouterr().out
+    assert "labels in 1 of 5 scans looked at, about 20 % of all points" in said
+    assert "\nboth         nothing is missing\n" in said
 
 
 def test_masks_without_a_class_to_align(kitti_drive: Path, capsys: pytest.CaptureFixture[str]) -> None:

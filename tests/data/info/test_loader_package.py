@@ -9,6 +9,7 @@ import pytest
 
 from sst_graph.cli import main
 from sst_graph.data import loader_names, open_source
+from sst_graph.data.source import loader_behind
 from sst_graph.errors import ConfigError, DataError
 
 PACKAGE = Path(__file__).parents[3] / "examples" / "loader_package"
@@ -64,6 +65,34 @@ def test_an_entry_point_that_fails_says_which(
         ConfigError, match="'odd' of sst_graph_npz:open_npz: found a function, expected a Loader"
     ):
         open_source(drive, loader="odd")
+
+
+def test_a_picture_of_another_size_is_named(
+    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    install(tmp_path / "site", monkeypatch, "npz = sst_graph_npz:LOADER")
+    odd = dict(np.load(drive / "000002.npz")) | {"pixels": np.zeros((30, 40, 3), np.uint8)}
+    np.savez(drive / "000002.npz", **odd)
+    assert main(["calibrate", str(drive), "--init", "none", "--out", str(tmp_path / "out")]) == 2
+    said = (
+        "frame 2: found a picture of 40x30 px, expected 80x60 px, the camera's size: all of a drive have it"
+    )
+    assert said in capsys.readouterr().err
+
+
+def test_an_exception_in_a_loader_is_told_from_others(
+    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install(tmp_path / "site", monkeypatch, "npz = sst_graph_npz:LOADER")
+    source = open_source(drive)
+    np.savez(drive / "000001.npz", stamp_ns=100_000_000)
+    with pytest.raises(KeyError) as caught:
+        source[1]
+    behind = loader_behind(caught.value)
+    assert behind is not None and behind[0] == "npz" and behind[1].startswith("sst_graph_npz.py:")
+    with pytest.raises(KeyError) as caught:
+        {}["not in a loader"]
+    assert loader_behind(caught.value) is None
 
 
 def test_the_names_of_our_own_are_not_replaced(
