@@ -32,6 +32,9 @@ that each is read in a tenth of a millisecond, and those of a long drive do not 
 _MAPPED_BYTES = 128 * 1024
 """Arrays of at least so many bytes are mapped: a match looks at a few hundred pixels of the 4 MB of a
 picture's gradients, and no more is read."""
+_MAPPED_AT_ONCE = 64 * 1024 * 1024
+"""A longer file is mapped anew after so many bytes of arrays: what was looked at in them is memory of the
+process as long as the mapping lasts."""
 _ALIGNMENT = 64
 """Arrays begin at multiples of so many bytes in the file."""
 
@@ -45,6 +48,8 @@ class ArrayStore:
         self._file: FileIO | None = None
         self._end = 0
         self._writable = True
+        self._mapped: mmap.mmap | None = None
+        self._read_from_it = 0
 
     def __del__(self) -> None:
         if (file := getattr(self, "_file", None)) is not None:
@@ -92,18 +97,27 @@ class ArrayStore:
             OSError: it cannot be read.
         """
         assert self._file is not None
-        size = math.prod(shape) * dtype.itemsize
+        count = math.prod(shape)
+        size = count * dtype.itemsize
         if size >= _MAPPED_BYTES:
             with suppress(OSError, ValueError):  # of a file that cannot be mapped
-                # Not by numpy.memmap, which takes as long again as the system.
-                before = start % mmap.ALLOCATIONGRANULARITY
-                file, length, access = self._file.fileno(), before + size, mmap.ACCESS_READ
-                mapped = mmap.mmap(file, length, access=access, offset=start - before)
-                return np.frombuffer(mapped, dtype, offset=before).reshape(shape)
+                mapped = self._mapping(start + size, size)
+                return np.frombuffer(mapped, dtype, count, start).reshape(shape)
         data = os.pread(self._file.fileno(), size, start)
         if len(data) < size:
             raise OSError(f"the temporary file of a drive ends {count_of(size - len(data), 'byte')} early")
         return np.frombuffer(bytearray(data), dtype).reshape(shape)
+
+    def _mapping(self, end: int, size: int) -> mmap.mmap:
+        """The file up to ``end`` or farther, for an array of so many bytes."""
+        assert self._file is not None
+        # Kept: to map each array takes ten times as long as to look up what a match needs of it.
+        mapped, much = self._mapped, min(self._read_from_it, self._end) > _MAPPED_AT_ONCE
+        if mapped is None or len(mapped) < end or much:
+            mapped = self._mapped = mmap.mmap(self._file.fileno(), self._end, access=mmap.ACCESS_READ)
+            self._read_from_it = 0
+        self._read_from_it += size
+        return mapped
 
 
 class StoredArray:

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import copy
 import logging
+import mmap
 import pickle
 import resource
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sst_graph.files import array_store
 from sst_graph.files.array_store import ArrayStore, StoredArray, replaced, shape_of, storable
 
 
@@ -149,6 +152,26 @@ def test_large_arrays_are_mapped_and_small_ones_are_read() -> None:
     np.testing.assert_array_equal(found[3], large + 1)
     store.__del__()  # and where it is closed
     np.testing.assert_array_equal(found[1], large)
+
+
+def test_one_mapping_serves_many_arrays_and_then_another_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    large = np.arange(100_000, dtype=np.int32)
+    store, mapped = ArrayStore(0), mmap.mmap
+    stored = [store.put(large + k) for k in range(3)]
+    made: list[int] = []
+
+    def counted(*args: Any, **kwargs: Any) -> mmap.mmap:
+        made.append(1)
+        return mapped(*args, **kwargs)
+
+    monkeypatch.setattr("mmap.mmap", counted)
+    kept = [each.get() for _ in range(3) for each in stored]
+    assert len(made) == 1
+    monkeypatch.setattr(array_store, "_MAPPED_AT_ONCE", 2 * large.nbytes)
+    kept += [each.get() for _ in range(3) for each in stored]
+    assert len(made) == 4
+    for k, array in enumerate(kept):  # those of an earlier mapping, too
+        np.testing.assert_array_equal(array, large + k % 3)
 
 
 def test_a_file_that_cannot_be_mapped_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
