@@ -19,6 +19,7 @@ from sst_graph.inspect.inspection_text import (
     MOST_SENTENCES,
     advice_sentences,
     correlation_sentence,
+    general_advice,
     weakest_ratio,
 )
 from sst_graph.inspect.misfit import DRIVING_MPS, misfits
@@ -191,6 +192,7 @@ def _next(inspection: Inspection) -> str:
     named = any(inspection.weakest.sentence in reason for reason in [*result.reasons, *weak])
     plan = inspection.plan
     advice = [] if plan is None else advice_sentences(inspection, plan)
+    rule = general_advice(inspection)
     return section(
         "next",
         "What is weak, and what to record next",
@@ -204,6 +206,10 @@ def _next(inspection: Inspection) -> str:
         if advice
         else "",
         bullets(capitalized(one) + "." for one in advice),
+        paragraph(f"What to record next, by the rule for the weakest direction: {rule}.") if rule else "",
+        paragraph("Sigmas of further frames are predicted for results of method joint only.", "note")
+        if rule
+        else "",
         paragraph("What to record next is predicted only from a result that can be trusted.", "note")
         if not trusted
         else "",

@@ -275,6 +275,15 @@ def test_the_weakest_direction_is_named_beside_a_remark() -> None:
         assert page.count(f"its limit: {html.escape(weakest)}") == expected
 
 
+def test_without_predictions_the_page_gives_a_rule() -> None:
+    """By edges no view of a frame is kept: what to record follows from the weakest direction."""
+    page = _page_by_edges()
+    section = page[page.index("What is weak, and what to record next") : page.index("Before and after")]
+    rule = html.escape(inspect_result(result_by_edges()).weakest.advice)
+    assert f"by the rule for the weakest direction: {rule}." in section and "method joint only" in section
+    assert "by the rule for" not in _page()
+
+
 def test_without_a_start_there_is_no_before() -> None:
     page = report_html(ReportInputs(replace(_result(), initial=None), [crowded_street()]))
     assert "The cloud in the pictures" in _checked(page).headings
