@@ -25,7 +25,7 @@ from sst_graph.inspect.inspection_text import (
 from sst_graph.inspect.misfit import DRIVING_MPS, misfits
 from sst_graph.inspect.reasons import as_sentence, capitalized, short_reasons
 from sst_graph.inspect.report import ReferenceErrors, error_lines, summary_rows
-from sst_graph.inspect.verdict import figure, fit_line, is_start, verdict
+from sst_graph.inspect.verdict import RIGHT_OVER_CHANCE, figure, fit_line, is_start, verdict
 from sst_graph.report.close_ups import ZOOM, close_ups
 from sst_graph.report.drawn_frame import DrawnFrame, DriveReader
 from sst_graph.report.html import (
@@ -79,9 +79,9 @@ _EDGES_HINT = (
     "one."
 )
 _CHECK = (
-    "Under a right calibration the share is 1.3 to 2 times that at random rotations. It judges all of the "
-    "result: a few centimetres or a roll that motion leaves open take it down to chance. Where it is lower "
-    "than at the start, the start is the better calibration."
+    f"Under a right calibration the share is {RIGHT_OVER_CHANCE} times that at random rotations. It judges "
+    "all of the result: a few centimetres or a roll that motion leaves open take it down to chance. Where it "
+    "is lower than at the start, the start is the better calibration."
 )
 _DRAG = (
     "Drag in the picture or move the slider: left of the line the cloud as the start would place it, "
