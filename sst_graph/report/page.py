@@ -78,6 +78,11 @@ _EDGES_HINT = (
     "calibration too. A row of points beside its outline, to the same side in several pictures, is a wrong "
     "one."
 )
+_SIGNS = (
+    " Of each side of the object the mean is given: with + the points lie outside {against}, with - inside. "
+    "The number of an object is that of the chart By object below; it has none where it has too few points "
+    "for that chart."
+)
 _CHECK = (
     f"Under a right calibration the share is {RIGHT_OVER_CHANCE} times that at random rotations. It judges "
     "all of the result: a few centimetres or a roll that motion leaves open take it down to chance. Where it "
@@ -252,10 +257,13 @@ def _pictures(inputs: ReportInputs, reader: DriveReader) -> str:
 
 
 def _drawn(fit: Fit, reader: DriveReader, most: int) -> list[DrawnFrame]:
-    """So many frames spread over the drives, each with the most boundary points of its part."""
-    counts = np.bincount(fit.points.frames, minlength=len(fit.frames))
+    """So many frames spread over the drives, each the one of its part with the most near boundary points that
+    agree with their contour or edge; the one with the most of all comes first."""
+    near = fit.points.weights / np.linalg.norm(fit.points.lPs, axis=1)
+    shown = np.bincount(fit.points.frames, near, minlength=len(fit.frames))
     parts = np.array_split(np.arange(len(fit.frames)), min(most, len(fit.frames)))
-    found = (reader.frame(fit.frames[int(part[counts[part].argmax()])]) for part in parts)
+    best = sorted((int(part[shown[part].argmax()]) for part in parts), key=lambda k: -shown[k])
+    found = (reader.frame(fit.frames[k]) for k in best)
     return [one for one in found if one is not None]
 
 
@@ -279,6 +287,8 @@ def _close_ups(inputs: ReportInputs, fit: Fit, reader: DriveReader) -> str:
     if not figures:
         return ""
     name, title = _named(inputs.result, fit, "objects", "Close-ups of objects")
+    against = "the edge" if fit.by_edges else "the contour"
+    hint += _SIGNS.format(against=against)
     return section(name, title, paragraph(hint), grid(figures, "large"))
 
 

@@ -325,6 +325,26 @@ def test_bars_of_objects_have_names_under_their_numbers(by: str) -> None:
 
 
 @pytest.mark.parametrize("by", PAGES)
+def test_close_ups_have_the_numbers_of_the_bars(by: str) -> None:
+    page = PAGES[by]()
+    (chart,) = re.findall(r"<h3>By object</h3>.*?</figure>", page, re.DOTALL)
+    names = re.findall(r"<li>(.*?)</li>", chart)
+    titles = re.findall(r"<h3>([a-z ]+?) (\d+) at (\d+) m, [^<]*</h3>", page)
+    assert len(titles) >= 2 and "with + the points lie outside" in page
+    assert all(names[int(number) - 1].startswith(f"{kind} at ") for kind, number, _ in titles)
+
+
+@pytest.mark.parametrize("by", PAGES)
+def test_the_first_picture_has_the_most_near_points(by: str) -> None:
+    fit = _fit() if by == "labels" else fit_by_edges()
+    assert fit is not None
+    near = fit.points.weights / np.linalg.norm(fit.points.lPs, axis=1)
+    best = fit.frames[int(np.bincount(fit.points.frames, near).argmax())]
+    shown = re.findall(r'aria-label="Image (\d+) of', PAGES[by]())
+    assert len(shown) == 3 and int(shown[0]) == best.image
+
+
+@pytest.mark.parametrize("by", PAGES)
 def test_no_zero_has_a_minus_sign(by: str) -> None:
     words = re.sub(r"<script.*?</script>|<style>.*?</style>| d=\"[^\"]*\"", "", PAGES[by](), flags=re.DOTALL)
     assert not re.search(r"-0\.0+(?!\d)", words)
@@ -403,7 +423,7 @@ def test_close_ups_without_labels_show_the_edge_that_each_point_is_compared_with
     that all have."""
     page = _page_by_edges()
     figures = re.findall(
-        r'<figure><h3>(object at [^<]*)</h3><svg class="closeup"(.*?)</figure>', page, re.DOTALL
+        r'<figure><h3>(object(?: \d+)? at [^<]*)</h3><svg class="closeup"(.*?)</figure>', page, re.DOTALL
     )
     assert len(figures) == COUNT and "label" not in " ".join(title for title, _ in figures)
     bias_px = abs(float(next(iter(solution_by_edges().state.biases_px.values()))))
