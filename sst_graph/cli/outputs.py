@@ -23,6 +23,7 @@ from sst_graph.report import ReportInputs, report_html
 from sst_graph.result import CalibrationResult
 from sst_graph.types import Source
 from sst_graph.viz import Placement
+from sst_graph.viz.overlay import legend_of
 
 RESULT_NAME = "calibration.json"
 REPORT_NAME = "report.html"
@@ -72,7 +73,7 @@ def _written(
     with_report: bool,
     progress: ProgressStage,
 ) -> list[str]:
-    pictures, frames = [], []
+    pictures, frames, shown_frames = [], [], []
     progress(0, PICTURES + 1)
     read = [with_sweep_of(source, result.diagnostics) for source in sources]
     for source, swept, plain in zip(sources, read, _file_names(sources), strict=True):
@@ -80,13 +81,15 @@ def _written(
         for position in telling_positions(drive, result, max(1, PICTURES // len(sources))):
             name = f"overlay_{plain}_{drive.number(position):06d}.png"
             shown = ShownFrame.of(drive, position, result)
+            shown_frames.append(shown.frame)
             (folder / name).write_bytes(png(overlay(shown, result, placement_before(result, source))))
             if with_report and result.fit is None:  # else the report chooses by the fit
                 frames.append(shown.drawn())
             pictures.append(name)
             progress(len(pictures), PICTURES + 1)
     (folder / RESULT_NAME).write_text(result.to_json(), encoding="utf-8")
-    (folder / "report.md").write_text(markdown_report(result, against, pictures), encoding="utf-8")
+    markdown = markdown_report(result, against, pictures, legend_of(shown_frames))
+    (folder / "report.md").write_text(markdown, encoding="utf-8")
     if not with_report:
         return [RESULT_NAME, "report.md", *pictures]
     drawn = [one for one in frames if one is not None]

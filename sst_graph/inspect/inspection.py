@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sst_graph.covariance.observability import ObservabilityConfig, weak_directions
+from sst_graph.covariance.observability import MOTION, SILHOUETTES, ObservabilityConfig, weak_directions
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.factors.arguments import described, is_whole
 from sst_graph.files.strict_json import json_able
@@ -211,7 +211,8 @@ def weakest_direction(result: CalibrationResult, limits: ObservabilityConfig) ->
         for name in ("rotation_deg", "translation_m", "time_offset_s")
     }
     tiny = dataclasses.replace(limits, **least)
-    return weak_directions(result.covariance, result.T_camera_lidar, tiny)[0]
+    advice = MOTION if result.method == "motion" else SILHOUETTES
+    return weak_directions(result.covariance, result.T_camera_lidar, tiny, advice)[0]
 
 
 def redundant_frames(frames: Sequence[FrameInformation], share: float) -> tuple[int, ...]:

@@ -23,7 +23,7 @@ from sst_graph.inspect.inspection import (
 from sst_graph.inspect.planning import MOST_FRAMES as MOST_RECORDED
 from sst_graph.inspect.planning import Plan, Prediction, RepeatedView
 from sst_graph.inspect.planning import limits_of as limits_of_result
-from sst_graph.inspect.verdict import fit_line
+from sst_graph.inspect.verdict import fit_line, is_start
 from sst_graph.result import CalibrationResult
 from sst_graph.types import FloatArray
 
@@ -46,7 +46,9 @@ def inspection_text(inspection: Inspection, all_frames: bool = False) -> str:
         plan = _NO_PLAN if inspection.plan is None else _plan_block(inspection, inspection.plan)
         blocks += [_frame_block(inspection, all_frames), plan]
     else:
-        blocks.append(gained_lines(inspection.result, inspection.gained, all_frames))
+        rule = general_advice(inspection)
+        lines = gained_lines(inspection.result, inspection.gained, all_frames)
+        blocks.append([*lines, f"- the rule for its weakest direction: {rule}"] if rule else lines)
     return "\n\n".join("\n".join(line.rstrip() for line in block) for block in blocks)
 
 
@@ -82,6 +84,17 @@ def frame_list(frames: Sequence[FrameInformation], positions: Sequence[int]) -> 
     if len({frame.frame.drive for frame in frames}) == 1:
         return ", ".join(word for words in by_drive.values() for word in words) or "none"
     return "; ".join(f"{drive}: {', '.join(words)}" for drive, words in by_drive.items()) or "none"
+
+
+def general_advice(inspection: Inspection) -> str:
+    """What to record where nothing is predicted: the rule for the weakest direction.
+
+    Empty with predictions, and of a result that is not to be trusted or holds no estimate.
+    """
+    result = inspection.result
+    if inspection.plan is not None or result.status == "not_converged" or is_start(result):
+        return ""
+    return inspection.weakest.advice
 
 
 def advice_sentences(inspection: Inspection, plan: Plan) -> list[str]:

@@ -135,9 +135,17 @@ def error_lines(errors: CalibrationErrors) -> list[str]:
 
 
 def markdown_report(
-    result: CalibrationResult, comparison: ReferenceErrors | None, pictures: Sequence[str]
+    result: CalibrationResult,
+    comparison: ReferenceErrors | None,
+    pictures: Sequence[str],
+    legend: str = "",
 ) -> str:
-    """A short Markdown page; ``pictures`` are file names beside it."""
+    """A short Markdown page.
+
+    Args:
+        pictures: file names beside it.
+        legend: sentences about what is drawn in them.
+    """
     blocks = [
         "# Calibration",
         verdict(result),
@@ -166,9 +174,7 @@ def markdown_report(
     if pictures:
         blocks += [
             "## Before and after",
-            f"Above {_ABOVE[result.initial is None]}, below the result. Vehicle points: green inside the "
-            "image's vehicle mask, red outside; the contour is the mask's. Without labels: points by depth, "
-            "red near, blue far.",
+            f"Above {_ABOVE[result.initial is None]}, below the result. {legend}".rstrip(),
             "\n\n".join(f"![{name}]({name})" for name in pictures),
         ]
     versions = ", ".join(f"{name} {number}" for name, number in result.versions.items())

@@ -14,6 +14,13 @@ from sst_graph.inspect.reasons import as_sentence, short_reasons
 from sst_graph.result import CalibrationResult
 
 CHECK_BY_EDGES = "a check by edges of the pictures, which the estimate has not used"
+RIGHT_OVER_CHANCE = "1.3 to 2"
+"""What the share of close edges is under a right calibration, in units of that at random rotations."""
+
+_FREED = "focal", "k1"
+"""Parameters of the lens that a record of ordinary length can determine beside the pose."""
+_MAY_FREE = "joint", "edges", "both"
+"""Methods that can estimate them."""
 
 
 def largest_sigmas(result: CalibrationResult) -> tuple[float, float, float]:
@@ -77,9 +84,19 @@ def fit_line(result: CalibrationResult) -> str:
         by_labels, by_edges = quality_line(quality, compared), quality_line(of_edges)
         return f"labels: {by_labels}; edges in frames without labels: {by_edges}"
     if result.fit_is_check:
-        return f"{CHECK_BY_EDGES}: {quality_line(quality)}"
+        return f"{CHECK_BY_EDGES}: {quality_line(quality)}{_over_chance(quality)}"
     contrast = "" if quality.by_chance is None else edges_line(result)
-    return "; ".join(line for line in (contrast, quality_line(quality, compared)) if line)
+    shares = quality_line(quality, compared)
+    # Many a point's strongest edge is another one: only the score has a limit that right ones keep.
+    return f"{contrast}; no measure by itself: {shares}" if contrast else shares
+
+
+def _over_chance(quality: FitQuality) -> str:
+    """How a share of edges is judged that no score stands beside."""
+    if not quality.by_chance:
+        return ""
+    ratio = quality.share / quality.by_chance
+    return f": {ratio:.1f} times chance, right calibrations have {RIGHT_OVER_CHANCE}"
 
 
 def edges_line(result: CalibrationResult) -> str:
@@ -113,7 +130,18 @@ def _known(result: CalibrationResult) -> str:
         f"{figure(degrees)}° and {figure(cm)} cm (one sigma): at {one.depth_m:.0f} m the cloud may be "
         f"{figure(one.pixels)} px off in the middle of the picture{corners}. "
         f"The time offset is known to {figure(ms)} ms."
+        + (f" {_lens_advice(result)}" if worth_saying and lens else "")
     )
+
+
+def _lens_advice(result: CalibrationResult) -> str:
+    """What to do where the lens makes the corners worse than the calibration does."""
+    advice = "For better corners calibrate the lens"
+    estimated = result.diagnostics.get("estimated")
+    free = [name for name in _FREED if not isinstance(estimated, dict) or name not in estimated]
+    if not free or result.method not in _MAY_FREE:
+        return f"{advice}."
+    return f"{advice}, or estimate it too: --estimate {','.join(free)}."
 
 
 def figure(value: float) -> str:

@@ -4,7 +4,7 @@ uncertainty moves them."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -20,6 +20,7 @@ from sst_graph.inspect.pixels import covariance_of_given_lens, drawn_covariance
 from sst_graph.report.drawn_frame import DrawnFrame, DriveReader
 from sst_graph.report.html import jpeg, text
 from sst_graph.report.overlay import CLASS_NAMES, Placements, project_points
+from sst_graph.report.residual_charts import object_numbers
 from sst_graph.result import CalibrationResult
 from sst_graph.types import FloatArray, IntArray, SemanticClass
 
@@ -58,11 +59,13 @@ class ObjectInFrame:
         points: positions of its boundary points.
         share: of the information that the whole drive gives, on average over the unknowns.
         worst: whether it is shown because its labels, or edges, agree least.
+        number: in the chart by object; None where that leaves it out.
     """
 
     points: IntArray
     share: float
     worst: bool = False
+    number: int | None = None
 
 
 def telling_detections(points: PointResiduals, covariance: FloatArray) -> list[ObjectInFrame]:
@@ -127,12 +130,14 @@ def close_ups(
     Args:
         placements: where the cloud of a drive is drawn, by its name.
     """
-    found = []
+    found, numbers = [], object_numbers(fit.points)
     for detection in telling_detections(fit.points, result.covariance):
         points = fit.points.take(detection.points)
         drawn = reader.frame(fit.frames[int(points.frames[0])])
         if drawn is not None:
-            found.append(_close_up(drawn, points, detection, placements(drawn.frame.drive), result))
+            number = numbers.get(int(points.tracks[0]))
+            of_object = replace(detection, number=number)
+            found.append(_close_up(drawn, points, of_object, placements(drawn.frame.drive), result))
     return found
 
 
@@ -170,7 +175,8 @@ def _close_up(
     by_edges = not _has_contours(points)
     worst = "edges agree least" if by_edges else "labels agree least"
     telling = "tells most" if result.fit_is_check else "determines most"
-    title = f"{class_name} at {range_m:.0f} m, {worst if detection.worst else telling}"
+    name = class_name if detection.number is None else f"{class_name} {detection.number}"
+    title = f"{name} at {range_m:.0f} m, {worst if detection.worst else telling}"
     of_kind = f" of the {'edges' if by_edges else 'labels'}" if len(result.fits) > 1 else ""
     information = f"{100.0 * detection.share:.1f} % of the information{of_kind}. "
     if result.fit_is_check:

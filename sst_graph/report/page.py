@@ -19,12 +19,13 @@ from sst_graph.inspect.inspection_text import (
     MOST_SENTENCES,
     advice_sentences,
     correlation_sentence,
+    general_advice,
     weakest_ratio,
 )
 from sst_graph.inspect.misfit import DRIVING_MPS, misfits
 from sst_graph.inspect.reasons import as_sentence, capitalized, short_reasons
 from sst_graph.inspect.report import ReferenceErrors, error_lines, summary_rows
-from sst_graph.inspect.verdict import figure, fit_line, is_start, verdict
+from sst_graph.inspect.verdict import RIGHT_OVER_CHANCE, figure, fit_line, is_start, verdict
 from sst_graph.report.close_ups import ZOOM, close_ups
 from sst_graph.report.drawn_frame import DrawnFrame, DriveReader
 from sst_graph.report.html import (
@@ -77,10 +78,15 @@ _EDGES_HINT = (
     "calibration too. A row of points beside its outline, to the same side in several pictures, is a wrong "
     "one."
 )
+_SIGNS = (
+    " Of each side of the object the mean is given: with + the points lie outside {against}, with - inside. "
+    "The number of an object is that of the chart By object below; it has none where it has too few points "
+    "for that chart."
+)
 _CHECK = (
-    "Under a right calibration the share is 1.3 to 2 times that at random rotations. It judges all of the "
-    "result: a few centimetres or a roll that motion leaves open take it down to chance. Where it is lower "
-    "than at the start, the start is the better calibration."
+    f"Under a right calibration the share is {RIGHT_OVER_CHANCE} times that at random rotations. It judges "
+    "all of the result: a few centimetres or a roll that motion leaves open take it down to chance. Where it "
+    "is lower than at the start, the start is the better calibration."
 )
 _DRAG = (
     "Drag in the picture or move the slider: left of the line the cloud as the start would place it, "
@@ -191,6 +197,7 @@ def _next(inspection: Inspection) -> str:
     named = any(inspection.weakest.sentence in reason for reason in [*result.reasons, *weak])
     plan = inspection.plan
     advice = [] if plan is None else advice_sentences(inspection, plan)
+    rule = general_advice(inspection)
     return section(
         "next",
         "What is weak, and what to record next",
@@ -204,6 +211,10 @@ def _next(inspection: Inspection) -> str:
         if advice
         else "",
         bullets(capitalized(one) + "." for one in advice),
+        paragraph(f"What to record next, by the rule for the weakest direction: {rule}.") if rule else "",
+        paragraph("Sigmas of further frames are predicted for results of method joint only.", "note")
+        if rule
+        else "",
         paragraph("What to record next is predicted only from a result that can be trusted.", "note")
         if not trusted
         else "",
@@ -246,10 +257,13 @@ def _pictures(inputs: ReportInputs, reader: DriveReader) -> str:
 
 
 def _drawn(fit: Fit, reader: DriveReader, most: int) -> list[DrawnFrame]:
-    """So many frames spread over the drives, each with the most boundary points of its part."""
-    counts = np.bincount(fit.points.frames, minlength=len(fit.frames))
+    """So many frames spread over the drives, each the one of its part with the most near boundary points that
+    agree with their contour or edge; the one with the most of all comes first."""
+    near = fit.points.weights / np.linalg.norm(fit.points.lPs, axis=1)
+    shown = np.bincount(fit.points.frames, near, minlength=len(fit.frames))
     parts = np.array_split(np.arange(len(fit.frames)), min(most, len(fit.frames)))
-    found = (reader.frame(fit.frames[int(part[counts[part].argmax()])]) for part in parts)
+    best = sorted((int(part[shown[part].argmax()]) for part in parts), key=lambda k: -shown[k])
+    found = (reader.frame(fit.frames[k]) for k in best)
     return [one for one in found if one is not None]
 
 
@@ -273,6 +287,8 @@ def _close_ups(inputs: ReportInputs, fit: Fit, reader: DriveReader) -> str:
     if not figures:
         return ""
     name, title = _named(inputs.result, fit, "objects", "Close-ups of objects")
+    against = "the edge" if fit.by_edges else "the contour"
+    hint += _SIGNS.format(against=against)
     return section(name, title, paragraph(hint), grid(figures, "large"))
 
 

@@ -133,16 +133,11 @@ def _by_frame(fit: Fit) -> str:
 
 def _by_object(fit: Fit) -> str:
     points = fit.points
-    tracks, numbers = np.unique(points.tracks, return_inverse=True)
-    groups = [own for own in _groups(numbers.reshape(-1), len(tracks)) if len(own) >= _LEAST_POINTS]
-    groups = sorted(groups, key=len, reverse=True)[:_MOST_OBJECTS]
-    if len(groups) < 2:
+    ordered = _objects(points)
+    if not ordered:
         return ""
-    middles = [
-        float(np.average(points.residuals_px[own], weights=points.weights[own] + 1e-9)) for own in groups
-    ]
-    order = np.argsort(middles)
-    names = [f"{_name(points.take(groups[k]))}: {middles[k]:+z.2f} px" for k in order]
+    groups, middles = [own for own, _ in ordered], [middle for _, middle in ordered]
+    names = [f"{_name(points.take(own))}: {middle:+z.2f} px" for own, middle in ordered]
     most = max(1.0, float(np.abs(middles).max()))
     chart = Chart(
         (0.5, len(groups) + 0.5),
@@ -155,7 +150,7 @@ def _by_object(fit: Fit) -> str:
     )
     chart.count_along_x()
     chart.level(0.0)
-    chart.bars(np.arange(1, len(groups) + 1), np.array(middles)[order], 0.8, "a", names)
+    chart.bars(np.arange(1, len(groups) + 1), np.array(middles), 0.8, "a", names)
     return figure(
         chart.svg(),
         "By object",
@@ -169,6 +164,25 @@ def _by_object(fit: Fit) -> str:
         below=numbered(names),
         kind="listed",
     )
+
+
+def object_numbers(points: PointResiduals) -> dict[int, int]:
+    """Number under which the chart by object has each track; only those that it shows."""
+    return {int(points.tracks[own[0]]): k for k, (own, _) in enumerate(_objects(points), start=1)}
+
+
+def _objects(points: PointResiduals) -> list[tuple[IntArray, float]]:
+    """Positions of the points of the objects with the most of them, and their mean residual [px], by which
+    they are ordered; none of a single object."""
+    tracks, numbers = np.unique(points.tracks, return_inverse=True)
+    groups = [own for own in _groups(numbers.reshape(-1), len(tracks)) if len(own) >= _LEAST_POINTS]
+    groups = sorted(groups, key=len, reverse=True)[:_MOST_OBJECTS]
+    if len(groups) < 2:
+        return []
+    middles = [
+        float(np.average(points.residuals_px[own], weights=points.weights[own] + 1e-9)) for own in groups
+    ]
+    return [(groups[k], middles[k]) for k in np.argsort(middles)]
 
 
 def _name(points: PointResiduals) -> str:

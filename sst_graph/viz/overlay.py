@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -86,7 +87,7 @@ def draw_overlay(
     )
     mask_class = _at(image.mask, uvs)[classes == SemanticClass.VEHICLE]
     uvs = (uvs + 0.5) * zoom - 0.5
-    if (scan.classes == SemanticClass.IGNORE).all():
+    if not _has_labels(scan):
         _draw_points(picture, uvs, _depth_colours(depths_m), 2)
         return np.vstack([_strip(picture.shape[1], _by_depth(caption)), picture])
     _draw_classes(picture, uvs, classes)
@@ -97,6 +98,28 @@ def draw_overlay(
     _draw_points(picture, vehicles[outside], OUT_OF_MASK, 2)
     words = _by_class(caption, int(inside.sum()), int(outside.sum()))
     return np.vstack([_strip(picture.shape[1], words), picture])
+
+
+def legend_of(frames: Sequence[Frame]) -> str:
+    """What :func:`draw_overlay` draws of some frames, in sentences."""
+    labelled = [_has_labels(frame.scan) for frame in frames if frame.scan is not None]
+    masks = [frame.image.mask for frame in frames if frame.image is not None]
+    outlined = any((mask == SemanticClass.VEHICLE).any() for mask in masks)
+    sentences = []
+    if any(labelled):
+        sentences.append(
+            "Vehicle points: green inside the image's vehicle mask, red outside; others by their class."
+        )
+    if not all(labelled):
+        whose = "Scans without labels: points" if any(labelled) else "Points"
+        sentences.append(f"{whose} by depth, red near, blue far.")
+    if outlined:
+        sentences.append("The contour is that of the vehicle mask.")
+    return " ".join(sentences)
+
+
+def _has_labels(scan: Scan) -> bool:
+    return bool((scan.classes != SemanticClass.IGNORE).any())
 
 
 def stacked(above: Picture, below: Picture) -> Picture:

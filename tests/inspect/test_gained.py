@@ -15,7 +15,7 @@ from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
 from sst_graph.hand_eye.graph import PRIOR_SIGMAS
 from sst_graph.inspect.gained import KEY, gained_of, pair_gains, to_document
 from sst_graph.inspect.inspection import inspect_result, to_dict
-from sst_graph.inspect.inspection_text import inspection_text
+from sst_graph.inspect.inspection_text import general_advice, inspection_text
 from sst_graph.result import CalibrationResult, FrameId
 from sst_graph.tracker.window.information_log import InformationLog
 
@@ -102,6 +102,22 @@ def test_where_nothing_can_be_said_it_says_why(method: str) -> None:
     text = inspection_text(inspect_result(_result(method)))
     assert f"is not known for this result of method {method}: " in text
     assert ("independent" in text) == (method in ("paper", "static", "semalign"))
+
+
+@pytest.mark.parametrize(
+    ("method", "rule"),
+    [
+        ("edges", "record motion with a change of speed or a turn"),
+        ("motion", "record turns that begin and end"),
+    ],
+)
+def test_without_predictions_the_rule_for_the_weakest_direction_is_given(method: str, rule: str) -> None:
+    covariance = np.diag(np.square([*np.radians([0.01] * 3), 0.001, 0.001, 0.001, 0.008]))
+    result = replace(_result(method), covariance=covariance, frames_used=(FrameId("a", 0),))
+    last = inspection_text(inspect_result(result)).splitlines()[-1]
+    assert last.startswith(f"- the rule for its weakest direction: {rule}")
+    untrusted = inspect_result(replace(result, status="not_converged", reasons=("a clock jumps",)))
+    assert general_advice(untrusted) == "" and "the rule for" not in inspection_text(untrusted)
 
 
 @pytest.mark.parametrize(

@@ -94,6 +94,12 @@ def test_the_lens_counts_in_the_corners_only() -> None:
     assert "0.1" in said and "1.2 px off in the middle" in said
     assert f"in the corners, where the lens counts, {with_lens.corner_px:.1f} px" in said
     assert "corners" not in verdict(_result([TINY] * 3 + [0.01] * 3 + [TINY]))
+    # And what to do about it, of what is not estimated already and where the method can.
+    assert said.endswith("calibrate the lens, or estimate it too: --estimate focal,k1.")
+    diagnostics = {**_with_k1().diagnostics, "estimated": {"focal": {"value": 0.0, "sigma": 1e-3}}}
+    assert verdict(replace(_with_k1(), diagnostics=diagnostics)).endswith(": --estimate k1.")
+    assert verdict(_with_k1("motion")).endswith("For better corners calibrate the lens.")
+    assert "lens" not in verdict(_result([TINY, TINY, 0.1 * DEG] + [TINY] * 4))
 
 
 def test_inspect_says_the_same_as_the_report() -> None:

@@ -71,7 +71,8 @@ def test_errors_without_an_offset_or_a_covariance() -> None:
 
 
 def test_report_shows_angles_on_vehicle_axes_and_pictures() -> None:
-    text = markdown_report(RESULT, None, ["overlay_1.png"])
+    text = markdown_report(RESULT, None, ["overlay_1.png"], "Points by depth.")
+    assert "Above the start, below the result. Points by depth.\n" in text and "mask" not in text
     for row in (
         "| roll | 2.0000 deg | 0.020 deg |",
         "| pitch | -1.0000 deg | 0.030 deg |",

@@ -160,6 +160,11 @@ def test_without_labels_the_fit_is_how_far_the_edges_stand_out() -> None:
     assert fit_line(other) == line + ", 1.20 times that of the best other optimum (1.08 or more expected)"
     quality = FitQuality(900, 0.4, None, 0.41, 0.2)
     both = {"contrast": contrast | expected, "fit_quality": quality.to_dict()}
-    assert fit_line(_result([0.01] * 7, diagnostics=both)) == f"{line}; {quality_line(quality)}"
+    assert (
+        fit_line(_result([0.01] * 7, diagnostics=both))
+        == f"{line}; no measure by itself: {quality_line(quality)}"
+    )
+    check = fit_line(_result([0.01] * 7, method="motion", diagnostics={"fit_quality": quality.to_dict()}))
+    assert check.endswith("at random rotations 20 %): 2.0 times chance, right calibrations have 1.3 to 2")
     for stored in (None, {}, contrast, contrast | expected | {"sigmas": "many"}):
         assert fit_line(_result([0.01] * 7, diagnostics={"contrast": stored})) == ""

@@ -275,6 +275,15 @@ def test_the_weakest_direction_is_named_beside_a_remark() -> None:
         assert page.count(f"its limit: {html.escape(weakest)}") == expected
 
 
+def test_without_predictions_the_page_gives_a_rule() -> None:
+    """By edges no view of a frame is kept: what to record follows from the weakest direction."""
+    page = _page_by_edges()
+    section = page[page.index("What is weak, and what to record next") : page.index("Before and after")]
+    rule = html.escape(inspect_result(result_by_edges()).weakest.advice)
+    assert f"by the rule for the weakest direction: {rule}." in section and "method joint only" in section
+    assert "by the rule for" not in _page()
+
+
 def test_without_a_start_there_is_no_before() -> None:
     page = report_html(ReportInputs(replace(_result(), initial=None), [crowded_street()]))
     assert "The cloud in the pictures" in _checked(page).headings
@@ -313,6 +322,26 @@ def test_bars_of_objects_have_names_under_their_numbers(by: str) -> None:
         ">1</text>" in chart
         and ">0.5</text>" not in chart[chart.index(">1</text>") : chart.index("object, ")]
     )
+
+
+@pytest.mark.parametrize("by", PAGES)
+def test_close_ups_have_the_numbers_of_the_bars(by: str) -> None:
+    page = PAGES[by]()
+    (chart,) = re.findall(r"<h3>By object</h3>.*?</figure>", page, re.DOTALL)
+    names = re.findall(r"<li>(.*?)</li>", chart)
+    titles = re.findall(r"<h3>([a-z ]+?) (\d+) at (\d+) m, [^<]*</h3>", page)
+    assert len(titles) >= 2 and "with + the points lie outside" in page
+    assert all(names[int(number) - 1].startswith(f"{kind} at ") for kind, number, _ in titles)
+
+
+@pytest.mark.parametrize("by", PAGES)
+def test_the_first_picture_has_the_most_near_points(by: str) -> None:
+    fit = _fit() if by == "labels" else fit_by_edges()
+    assert fit is not None
+    near = fit.points.weights / np.linalg.norm(fit.points.lPs, axis=1)
+    best = fit.frames[int(np.bincount(fit.points.frames, near).argmax())]
+    shown = re.findall(r'aria-label="Image (\d+) of', PAGES[by]())
+    assert len(shown) == 3 and int(shown[0]) == best.image
 
 
 @pytest.mark.parametrize("by", PAGES)
@@ -394,7 +423,7 @@ def test_close_ups_without_labels_show_the_edge_that_each_point_is_compared_with
     that all have."""
     page = _page_by_edges()
     figures = re.findall(
-        r'<figure><h3>(object at [^<]*)</h3><svg class="closeup"(.*?)</figure>', page, re.DOTALL
+        r'<figure><h3>(object(?: \d+)? at [^<]*)</h3><svg class="closeup"(.*?)</figure>', page, re.DOTALL
     )
     assert len(figures) == COUNT and "label" not in " ".join(title for title, _ in figures)
     bias_px = abs(float(next(iter(solution_by_edges().state.biases_px.values()))))

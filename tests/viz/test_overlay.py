@@ -12,7 +12,7 @@ from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.types import CameraImage, Frame, Scan, SemanticClass
 from sst_graph.viz import draw_overlay
-from sst_graph.viz.overlay import CONTOUR, IN_MASK, MIN_WIDTH_PX, NOT_MATCHED, OUT_OF_MASK
+from sst_graph.viz.overlay import CONTOUR, IN_MASK, MIN_WIDTH_PX, NOT_MATCHED, OUT_OF_MASK, legend_of
 
 CAMERA = PinholeCamera(500.0, 500.0, 400.0, 100.0, 800, 200)
 WHERE = gtsam.Pose3()
@@ -54,6 +54,18 @@ def test_points_without_labels_are_drawn_by_depth() -> None:
     # One point with a label, and the legend is that of the classes again.
     labelled = replace(frame, scan=replace(frame.scan, classes=np.array([SemanticClass.GROUND, 0], np.uint8)))
     assert not np.array_equal(draw_overlay(labelled, CAMERA, WHERE, 0.0)[-200:][100, 400], image[100, 400])
+
+
+def test_the_legend_names_what_is_drawn() -> None:
+    labelled = _frame([[0, 0, 10]], [SemanticClass.VEHICLE])
+    masked = _frame([[0, 0, 10]], [SemanticClass.IGNORE])
+    assert masked.image is not None
+    nothing = replace(masked.image, mask=np.full((200, 800), SemanticClass.IGNORE, np.uint8))
+    plain = replace(masked, image=nothing)
+    assert legend_of([plain]) == "Points by depth, red near, blue far."
+    assert legend_of([masked]) == f"{legend_of([plain])} The contour is that of the vehicle mask."
+    assert "green inside" in legend_of([labelled]) and "depth" not in legend_of([labelled])
+    assert "by their class. Scans without labels: points by depth" in legend_of([labelled, plain])
 
 
 def test_the_contour_follows_the_picture_and_is_dark_where_it_shows_nothing() -> None:
