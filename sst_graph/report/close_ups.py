@@ -162,7 +162,7 @@ def _close_up(
     placements: Placements,
     result: CalibrationResult,
 ) -> str:
-    uvs, _ = project_points(drawn, points, placements.after)
+    uvs, _ = project_points(drawn.through(placements.camera), points, placements.after)
     A = _uv_H_unknowns(drawn, points, placements)
     moves = _two_sigma_moves(A, covariance_of_given_lens(result))
     crop = _Crop.around(uvs, _leverages(points, result.covariance), drawn.image.pixels)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -29,6 +29,11 @@ class DrawnFrame:
     scan: Scan
     image: CameraImage
     camera: PinholeCamera
+
+    def through(self, camera: PinholeCamera) -> DrawnFrame:
+        """The same, its points projected by another camera of the same pictures."""
+        same = (camera.width, camera.height) == (self.camera.width, self.camera.height)
+        return replace(self, camera=camera) if same else self
 
     def projected(self, cTl: gtsam.Pose3, time_offset_s: float) -> tuple[FloatArray, FloatArray]:
         """(n, 2) pixels of the scan's points, NaN behind the camera, and their depths (n,) [px], [m]."""

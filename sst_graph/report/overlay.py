@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.mask_contour import ContourMap
 from sst_graph.fit import PointResiduals
 from sst_graph.report.drawn_frame import DrawnFrame
@@ -36,10 +37,12 @@ class Placements:
     Attributes:
         before: at the start; None without a start.
         after: in the result.
+        camera: of the result, with what was estimated of its lens.
     """
 
     before: Calibration | None
     after: Calibration
+    camera: PinholeCamera
 
 
 def overlay(drawn: DrawnFrame, placements: Placements, points: PointResiduals | None, edge_name: str) -> str:
@@ -99,7 +102,7 @@ def project_points(
 
 def _cloud(drawn: DrawnFrame, placements: Placements) -> list[FloatArray]:
     """Pixels before and after, depths, classes and (no) residuals of points in one of the pictures."""
-    after, depths = drawn.projected(*placements.after)
+    after, depths = drawn.through(placements.camera).projected(*placements.after)
     before = after if placements.before is None else drawn.projected(*placements.before)[0]
     seen = np.flatnonzero(drawn.camera.in_image(after) | drawn.camera.in_image(before))
     seen = seen[:: step_for(len(seen), _MOST_POINTS)]
@@ -110,7 +113,7 @@ def _cloud(drawn: DrawnFrame, placements: Placements) -> list[FloatArray]:
 
 
 def _boundary(drawn: DrawnFrame, placements: Placements, points: PointResiduals) -> list[FloatArray]:
-    after, depths = project_points(drawn, points, placements.after)
+    after, depths = project_points(drawn.through(placements.camera), points, placements.after)
     before = after if placements.before is None else project_points(drawn, points, placements.before)[0]
     # The contour stays, so the residual changes by the pixel's step across it.
     change = ((before - after) * points.normals).sum(axis=1)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from sst_graph.assumptions import ASSUMPTIONS
+from sst_graph.cameras.estimated_camera import EstimatedCamera
 from sst_graph.files.strict_json import json_able
 from sst_graph.fit import CLOSE_PX, Fit, MatchedFrame
 from sst_graph.inspect.budget_text import budget_rows
@@ -274,9 +275,8 @@ def _points_of(fit: Fit, frame: MatchedFrame) -> np.ndarray[Any, np.dtype[np.boo
 def _placements(result: CalibrationResult, drive: str) -> Placements:
     own = {one.drive: one.time_offset_s for one in result.drive_offsets}
     after = Calibration(result.T_camera_lidar, own.get(drive, result.time_offset_s))
-    if result.initial is None:
-        return Placements(None, after)
-    return Placements(Calibration(result.initial, result.initial_time_offset_s), after)
+    before = None if result.initial is None else Calibration(result.initial, result.initial_time_offset_s)
+    return Placements(before, after, EstimatedCamera.of(result))
 
 
 def _close_ups(inputs: ReportInputs, fit: Fit, reader: DriveReader) -> str:
