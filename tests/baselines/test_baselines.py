@@ -216,7 +216,8 @@ def test_no_vehicle_in_any_frame(
 ) -> None:
     shutil.copytree(street, tmp_path / "bare")
     for labels in (tmp_path / "bare").rglob("*.label"):
-        labels.write_bytes(bytes(labels.stat().st_size))
+        numbers = np.fromfile(labels, "<u4") & 0xFFFF
+        labels.write_bytes(np.where(np.isin(numbers, [10, 18]), 0, numbers).astype("<u4").tobytes())
     options = ["--method", method, "--frames", "0:4", "--out", str(tmp_path / "result")]
     assert main(["calibrate", str(tmp_path / "bare"), *options]) == 3
     *_, reason = capsys.readouterr().err.splitlines()
