@@ -51,7 +51,7 @@ class SourceOptions:
         sequence: name of the sequence within the data set, or None for the only one.
         frames: frames to use, as a slice of their indices (step 1), or None for all. Where the sensors have
             stamps of their own, frames are counted in the order of stamps.
-        image_shift: scan k is paired with image k + image_shift, stamped as if it were image k.
+        image_shift: image k + image_shift gets the stamp of image k.
         camera: name of the camera, "image_2".
         cloud: name of the folder that holds the scans.
         label_encoding: how mask numbers are to be read; "auto" decides between the two of Cityscapes (ids,
