@@ -34,7 +34,7 @@ from .camera import MIN_DEPTH_M
 from .condensed import gram, square_root
 from .errors import FactorError
 from .matches import Alignment
-from .motion import CameraTwist, GroupsMoved, PointwiseMoved, RigidlyMoved, moved_points
+from .motion import CameraTwist, GroupsMoved, PointwiseMoved, RigidlyMoved, move_groups, moved_points
 
 
 @overload
@@ -271,6 +271,45 @@ def evaluate_moved(
     if any_behind:
         rows[:, :, behind] = 0.0
     return Evaluated(rows, lift, behind if any_behind else None)
+
+
+@dataclass(frozen=True)
+class ImageGroups:
+    """Where the matches of several images stand in one alignment, one image after the other.
+
+    Attributes:
+        bounds: (g + 1,) first match of each image, and the end.
+        accelerations: (g, 6) of the twist at each image where its matches move as one rigid body, else None.
+    """
+
+    bounds: NDArray[np.intp]
+    accelerations: FloatArray | None
+
+    @classmethod
+    def of(cls, alignment: Alignment, bounds: NDArray[np.intp]) -> ImageGroups:
+        """Those of an alignment whose images begin at ``bounds``."""
+        starts, each = bounds[:-1], np.broadcast_to(alignment.c_acceleration, (len(alignment), 6))
+        own = np.column_stack([alignment.base_taus_s, each])
+        rigid = np.array_equal(own, np.repeat(own[starts], np.diff(bounds), axis=0))
+        return cls(bounds, each[starts] if rigid and alignment.motion_model == "se3" else None)
+
+    def evaluate(
+        self,
+        alignment: Alignment,
+        cTl: gtsam.Pose3,
+        time_offset_s: float,
+        c_twists: FloatArray,
+        bias_px: FloatArray,
+    ) -> Evaluated:
+        """Residuals of the matches and their derivatives, not weighted; c_twists (g, 6) at the images."""
+        if self.accelerations is None:
+            twists = c_twists.repeat(np.diff(self.bounds), axis=0).T
+            return evaluate(alignment, cTl, time_offset_s, twists, bias_px, True)
+        motion = CameraTwist(c_twists, self.accelerations)
+        taus_s = time_offset_s + alignment.base_taus_s[self.bounds[:-1]]
+        lPs, velocities = alignment.columns[0], alignment.velocity_columns
+        moved = move_groups(cTl, lPs, self.bounds, taus_s, motion, velocities)
+        return evaluate_moved(alignment, moved, bias_px, True)
 
 
 def _write_residuals(

@@ -64,27 +64,25 @@ def run(argv: Sequence[str], own_process: bool = False, tells_apart: bool = Fals
             raise
         from sst_graph.data.source import loader_behind  # help and usage do without the readers
 
+        _LOG.debug("where it was", exc_info=error)
         of_loader = loader_behind(error)
         if of_loader is not None:
-            _LOG.debug("where it was", exc_info=error)
-            return _failed(_in_loader(error, *of_loader), EXIT_BAD_INPUT)
-        _LOG.debug("where it was", exc_info=error)
+            name, place = of_loader
+            words = f"in the loader {name}: {_named(error)} ({place}; --verbose shows all)"
+            return _failed(words, EXIT_BAD_INPUT)
         return _failed(_unexpected(error), defect)
 
 
-def _in_loader(error: Exception, name: str, place: str) -> str:
-    """What the loader of another package did not foresee, on one line."""
-    what = " ".join(f"{type(error).__name__}: {error}".split())
-    return f"in the loader {name}: {printable(what, _LONGEST)} ({place}; --verbose shows all)"
+def _named(error: Exception) -> str:
+    """An exception by its type and text, on one line."""
+    return printable(" ".join(f"{type(error).__name__}: {error}".split()), _LONGEST)
 
 
 def _unexpected(error: Exception) -> str:
     """What nobody foresaw, on one line: a defect of this program."""
     steps = traceback.extract_tb(error.__traceback__)
     where = f" at {os.path.basename(steps[-1].filename)}:{steps[-1].lineno}" if steps else ""
-    what = " ".join(f"{type(error).__name__}: {error}".split())
-    advice = "a defect, please report it with what --verbose says"
-    return f"unexpected {printable(what, _LONGEST)}{where} ({advice})"
+    return f"unexpected {_named(error)}{where} (a defect, please report it with what --verbose says)"
 
 
 def _run(argv: Sequence[str], own_process: bool) -> int:

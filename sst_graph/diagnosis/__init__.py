@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from sst_graph.diagnosis.cameras import uncalibrated
 from sst_graph.diagnosis.causes import likely_causes, mirror, preflight
-from sst_graph.diagnosis.finding import Finding
+from sst_graph.diagnosis.finding import INVERTED, Finding
 from sst_graph.diagnosis.fit import Fitter, LabelFit
 from sst_graph.diagnosis.labels import few_labelled
 from sst_graph.diagnosis.lasers import other_axes, unknown_lasers
 from sst_graph.diagnosis.poses import other_camera
 
 __all__ = [
+    "INVERTED",
     "Finding",
     "Fitter",
     "LabelFit",

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+INVERTED = "the start (Tr) is inverted", "give T_camera_lidar, from LiDAR to camera"
+"""Cause and check of a start that leads from the camera to the LiDAR, by whatever data it is found."""
+
 
 @dataclass(frozen=True)
 class Finding:

@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 
 from sst_graph.association.time_pairing import pair_by_time
-from sst_graph.diagnosis.finding import Finding
+from sst_graph.diagnosis.finding import INVERTED, Finding
 from sst_graph.diagnosis.fit import (
     LEAST_CONCENTRATION,
     LEAST_EXPLAINED_GAIN,
@@ -179,7 +179,7 @@ def _starts(guess: gtsam.Pose3 | None) -> Iterator[tuple[str, str, gtsam.Pose3]]
         return
     check = "turn the clouds, or correct the start (Tr)"
     half = np.pi
-    yield "the start (Tr) is inverted", "give T_camera_lidar, from LiDAR to camera", guess.inverse()
+    yield *INVERTED, guess.inverse()
     yield "the clouds are turned by 180 deg about their z axis", check, _turned(guess, gtsam.Rot3.Rz(half))
     yield "the clouds are upside down", check, _turned(guess, gtsam.Rot3.Rx(half))
     yield (

@@ -20,8 +20,7 @@ import numpy as np
 from sst_graph.assumptions import named_sigmas
 from sst_graph.drive.twists import camera_covariances
 from sst_graph.factors.matches import Alignment
-from sst_graph.factors.motion import CameraTwist, move_groups
-from sst_graph.factors.reprojection import Evaluated, evaluate, evaluate_moved, weigh
+from sst_graph.factors.reprojection import Evaluated, ImageGroups, weigh
 from sst_graph.factors.velocity import transferred
 from sst_graph.graph.building import UNKNOWN_TWIST_SIGMAS, prior_graph
 from sst_graph.graph.known import KnownCalibration
@@ -186,13 +185,9 @@ class _Frames:
         return np.searchsorted(self.bounds, self.cells, side="right") - 1
 
     @cached_property
-    def accelerations(self) -> FloatArray | None:
-        """(f, 6) of the twist at each image where its matches move as one rigid body, else None."""
-        alignment, starts = self.alignment, self.bounds[:-1]
-        each = np.broadcast_to(alignment.c_acceleration, (len(alignment), 6))
-        own = np.column_stack([alignment.base_taus_s, each])
-        rigid = np.array_equal(own, np.repeat(own[starts], np.diff(self.bounds), axis=0))
-        return each[starts] if rigid and alignment.motion_model == "se3" else None
+    def groups(self) -> ImageGroups:
+        """Its images in the alignment."""
+        return ImageGroups.of(self.alignment, self.bounds)
 
     @cached_property
     def columns(self) -> IntArray:
@@ -385,17 +380,9 @@ class FrozenProblem:
 
     def _evaluated(self, frames: _Frames, point: FrozenPoint) -> Evaluated:
         """Residuals of a drive's matches and their derivatives, not weighted."""
-        alignment, time_offset_s = frames.alignment, float(point.scalars[frames.clock - 6])
-        biases_px = point.scalars[frames.biases - 6]
-        if frames.accelerations is None:
-            twists = point.twists[frames.images].T
-            evaluated = evaluate(alignment, point.cTl, time_offset_s, twists, biases_px, True)
-        else:
-            motion = CameraTwist(point.twists[frames.places], frames.accelerations)
-            taus_s = time_offset_s + alignment.base_taus_s[frames.bounds[:-1]]
-            lPs, velocities = alignment.columns[0], alignment.velocity_columns
-            moved = move_groups(point.cTl, lPs, frames.bounds, taus_s, motion, velocities)
-            evaluated = evaluate_moved(alignment, moved, biases_px, True)
+        time_offset_s, biases_px = float(point.scalars[frames.clock - 6]), point.scalars[frames.biases - 6]
+        twists = point.twists[frames.places]
+        evaluated = frames.groups.evaluate(frames.alignment, point.cTl, time_offset_s, twists, biases_px)
         if not self._terms:
             return evaluated
         steps = point.scalars[np.array(self._terms) - 6] - frames.terms_at

@@ -7,6 +7,7 @@ import math
 import gtsam
 import numpy as np
 
+from sst_graph.cameras.estimated_camera import EstimatedCamera
 from sst_graph.errors import count_of
 from sst_graph.fit import CLOSE_PX, EDGES_QUALITY, FitQuality
 from sst_graph.inspect.misfit import MIDDLE_M, misfit_at
@@ -137,8 +138,8 @@ def _known(result: CalibrationResult) -> str:
 def _lens_advice(result: CalibrationResult) -> str:
     """What to do where the lens makes the corners worse than the calibration does."""
     advice = "For better corners calibrate the lens"
-    estimated = result.diagnostics.get("estimated")
-    free = [name for name in _FREED if not isinstance(estimated, dict) or name not in estimated]
+    estimated = EstimatedCamera.of(result).estimated
+    free = [name for name in _FREED if name not in estimated]
     if not free or result.method not in _MAY_FREE:
         return f"{advice}."
     return f"{advice}, or estimate it too: --estimate {','.join(free)}."

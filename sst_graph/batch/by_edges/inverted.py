@@ -12,7 +12,7 @@ from sst_graph.batch.by_edges.problem import LabelEstimate, edges_problem
 from sst_graph.batch.by_edges.reasons import contrast_reasons, edge_contrast
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.problem import CalibrationProblem
-from sst_graph.diagnosis import Finding
+from sst_graph.diagnosis import INVERTED, Finding
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
 from sst_graph.stepwise import run_to_end
@@ -45,11 +45,12 @@ def inverted_start(drives: Sequence[Drive], guess: Guess, config: CalibrationCon
     contrast = edge_contrast(problem.subset_edges, best, others, config.seed)
     if contrast_reasons(contrast):
         return None
+    cause, check = INVERTED
     return Finding(
-        "the start (Tr) is inverted",
+        cause,
         f"around its inverse edges of LiDAR and pictures agree better than at rotations 2 to 4 deg away, by "
         f"{contrast.sigmas:.1f} standard deviations",
-        "give T_camera_lidar, from LiDAR to camera",
+        check,
     )
 
 

@@ -14,9 +14,8 @@ import numpy as np
 
 from sst_graph.association.edge_matching import MatchConfig
 from sst_graph.assumptions.model import Scene
-from sst_graph.factors.alignment import Alignment, weighted_residuals
-from sst_graph.factors.motion import CameraTwist, move_groups
-from sst_graph.factors.reprojection import evaluate_moved, weigh
+from sst_graph.factors.alignment import Alignment
+from sst_graph.factors.reprojection import ImageGroups, weigh
 from sst_graph.graph.matching import PairMatches
 from sst_graph.graph.nuisances import columns_of_jacobian
 from sst_graph.graph.state import lower_edge_track
@@ -154,22 +153,17 @@ def _weighted(
     with biases (m,) [px]."""
     point, bounds = pairs[0].point, np.append(0, np.cumsum(counts))
     twists = np.array([one.pair.motion.c_twist for one in pairs])
-    taus_s = point.time_offset_s + alignment.base_taus_s
-    of_pairs = taus_s[bounds[:-1]]
-    if (taus_s != of_pairs.repeat(counts)).any():
-        # Points have times of their own.
-        at = point.cTl, point.time_offset_s, twists.repeat(counts, axis=0).T
-        r, J, _ = weighted_residuals(alignment, *at, biases_px)
-        return J, r
-    motion = CameraTwist(twists, alignment.c_acceleration[bounds[:-1]])
-    lPs, velocities = alignment.columns[0], alignment.velocity_columns
-    moved = move_groups(point.cTl, lPs, bounds, of_pairs, motion, velocities)
-    evaluated = evaluate_moved(alignment, moved, biases_px, jacobians=True)
+    groups = ImageGroups.of(alignment, bounds)
+    evaluated = groups.evaluate(alignment, point.cTl, point.time_offset_s, twists, biases_px)
     weigh(alignment, evaluated)
+    if groups.accelerations is None:
+        system = evaluated.system()
+        return system[:-1].T, system[-1]
+    assert evaluated.lift is not None
     rows, motion_rows = evaluated.rows[:, 0], evaluated.motion_rows
     J = np.empty((len(alignment), 14))
     J[:, 13] = rows[-2]
-    for lift, (a, b) in zip(moved.lift, pairwise(bounds.tolist()), strict=True):
+    for lift, (a, b) in zip(evaluated.lift, pairwise(bounds.tolist()), strict=True):
         np.matmul(rows[:motion_rows, a:b].T, lift.T, out=J[a:b, :13])
     return J, rows[-1]
 
