@@ -8,19 +8,22 @@ shift of its picture and of its stamp; what these vary by beyond their own varia
 image k by the unknowns and by its shifts, and P the inverse of the information, they add
 
     sum_k P J_k'H_k diag(s^2) H_k'J_k P.
+
+A batch sees all images at once; a tracker adds up the moments of the shifts and the scores J_k'H_k of those
+that leave its window.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import gtsam
 import numpy as np
 
 from sst_graph.covariance.cluster_robust import RobustCovariance
 from sst_graph.covariance.considered import columns_of, weighted_columns
-from sst_graph.covariance.error_model import spread_beyond
 from sst_graph.covariance.match_table import MatchTable
 from sst_graph.covariance.sums import summed_rows
 from sst_graph.covariance.undecided_sweep import MATTERS
@@ -49,10 +52,23 @@ class ImageShifts:
     sigmas: FloatArray
     parts: FloatArray
 
+    @classmethod
+    def none(cls) -> ImageShifts:
+        """None, of extrinsic and one offset."""
+        return cls(np.zeros(3), np.zeros((3, 7, 7)))
+
     @property
     def covariance(self) -> FloatArray:
         """(s, s) of extrinsic and offsets by all of them."""
         return np.asarray(self.parts.sum(axis=0))
+
+    @property
+    def diagnostics(self) -> dict[str, Any]:
+        """JSON-able: the deviations [px, px], [ms]."""
+        return {
+            "image_shift_px": self.sigmas[:2].round(3).tolist(),
+            "stamp_jitter_ms": round(1e3 * float(self.sigmas[2]), 3),
+        }
 
     def sentences(self, covariance: FloatArray) -> tuple[str, ...]:
         """That the pictures shift, and that their stamps jitter, where it makes up much of a covariance
@@ -122,38 +138,32 @@ def shifts_of(table: MatchTable, bread: FloatArray, H: FloatArray, images: IntAr
     members = np.split(order, np.flatnonzero(np.diff(images[order])) + 1)
     # 1. The variance of the shifts.
     r = table.root_weights * table.r
-    fits = [_fitted(H[own], r[own], table.sides[own]) for own in members]
-    variances = _variances([fit for fit in fits if fit is not None])
+    moments = sum((shift_moments(H[own], r[own], table.sides[own]) for own in members), NO_MOMENTS)
+    variances = shift_variances(moments)
     # 2. What it does to the estimate.
     effects = [bread @ (table.J[own].T @ H[own]) for own in members]
     parts = [sum(np.outer(G[:, k], G[:, k]) for G in effects) * variances[k] for k in range(3)]
     return ImageShifts(np.sqrt(variances), np.array(parts))
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """The shifts of one picture [px, px] and of its stamp [s]; infinite variances where it is not fitted.
-
-    Attributes:
-        shift: (3,) across, down, later.
-        independent: (3,) variances if all matches erred by themselves.
-        by_sides: (3,) the same from the scatter of the sides of objects.
-    """
-
-    shift: FloatArray
-    independent: FloatArray
-    by_sides: FloatArray
+NO_MOMENTS: FloatArray = np.zeros((3, 7))
+"""Moments of no image."""
 
 
-def _fitted(H: FloatArray, r: FloatArray, sides: IntArray) -> _Fit | None:
-    """The shifts by the matches of one image, of the picture alone where they do not determine the stamp's;
-    None where they determine neither.
+def shift_moments(H: FloatArray, r: FloatArray, sides: IntArray) -> FloatArray:
+    """(3, 7) what the matches of one image tell of each of its shifts, to be summed over images; 0 of a shift
+    that they do not determine.
+
+    With s the shift and v its variance [px, px, ms]: 1, v if all matches err by themselves, v from the
+    scatter of the sides of objects; and of the former 1 / v, 1 / v^2, s / v, s^2 / v.
 
     Args:
-        H: (m, 3) derivatives of the residuals, weighted.
+        H: (m, 3) derivatives of the residuals by a shift across, down, and of the stamp, weighted.
         r: (m,) residuals, weighted.
         sides: (m,) numbers of the sides of objects.
     """
+    found = NO_MOMENTS.copy()
+    # The picture alone where the matches do not determine the shift of the stamp.
     for used in (3, 2):
         own = H[:, :used]
         scale = 1.0 / np.maximum(np.linalg.norm(own, axis=0), 1e-12)
@@ -168,22 +178,33 @@ def _fitted(H: FloatArray, r: FloatArray, sides: IntArray) -> _Fit | None:
         if len(names) < used + _LEAST_SIDES:
             continue
         scores = scores @ inverse * np.sqrt(len(names) / (len(names) - used))
-        found = np.stack([shift, np.diag(inverse), (scores**2).sum(axis=0)])
-        return _Fit(*np.pad(found, ((0, 0), (0, 3 - used)), constant_values=np.inf))
-    return None
+        units = _UNITS[:used]
+        s, alone = shift / units, np.maximum(np.diag(inverse) / units**2, _LEAST_VARIANCE)
+        by_sides = (scores**2).sum(axis=0) / units**2
+        v = 1.0 / alone
+        found[:used] = np.stack([np.ones(used), alone, by_sides, v, v**2, v * s, v * s**2], axis=1)
+        break
+    return found
 
 
-def _variances(fits: Sequence[_Fit]) -> FloatArray:
+_LEAST_VARIANCE = 1e-9
+"""Of a shift [px^2, ms^2]: no image tells more."""
+
+
+def shift_variances(moments: FloatArray) -> FloatArray:
     """(3,) variances of the shifts beyond those of their fits [px^2, px^2, s^2]; 0 of a single image.
 
     The scatter of one image's few sides tells little: images share the ratio by which it is larger than that
     of independent matches.
+
+    Args:
+        moments: (3, 7) summed over the images, of :func:`shift_moments`.
     """
-    every = np.array([(fit.shift, fit.independent, fit.by_sides) for fit in fits]).reshape(-1, 3, 3)
     found = np.zeros(3)
-    for k, of_kind in enumerate(every.transpose(2, 0, 1)):
-        shift, independent, by_sides = of_kind[np.isfinite(of_kind[:, 0])].T
-        if len(shift) > 1:
-            own = independent * (by_sides.sum() / independent.sum())
-            found[k] = spread_beyond(shift / _UNITS[k], own / _UNITS[k] ** 2, np.zeros(len(own), np.intp))
+    for k, (count, alone, by_sides, v, v2, vs, vss) in enumerate(moments):
+        weight = v - v2 / v if count > 1 else 0.0
+        if weight > 1e-9:
+            # By the method of moments, with weights by the variances of independent matches.
+            beyond = vss - vs**2 / v - by_sides / alone * (count - 1)
+            found[k] = max(0.0, beyond / weight)
     return np.asarray(found * _UNITS**2)

@@ -4,7 +4,7 @@ What leaves the window is kept as one Gaussian on the unknowns x and the paramet
 (:class:`~sst_graph.tracker.window.gaussian.Gaussian`), and as sums of the scores of sides over both.
 With H the information of past and window on [x, theta], g its vector at the estimate and a = [-H_xx^-1 H_xt,
 1], the score of theta with all unknowns free is a'g, its variance a'(H + S)a where S is what clusters of
-matches add, and
+matches and shifts from image to image add, and
 
     theta = a'g / (a'H a / f + s^-2)
 
@@ -41,7 +41,8 @@ def score_findings(smoother: WindowSmoother, config: AssumptionConfig) -> tuple[
     follows = -(inverted(H[:n, :n]) @ H[:n, n:])
     A = np.concatenate([follows, np.eye(smoother.past.held)])
     score, information = A.T @ g, np.einsum("nk,nm,mk->k", A, H, A)
-    excess = np.einsum("nk,nm,mk->k", A, smoother.excess(with_held=True), A)
+    beyond = smoother.excess(with_held=True) + smoother.shift_excess()[1].sum(axis=0)
+    excess = np.einsum("nk,nm,mk->k", A, beyond, A)
     spans = {name: assumption.span for name, assumption in ASSUMPTIONS.items()}
     before = np.array([spans.get(name, 1.0) ** -2.0 for name in smoother.held_names])
     curvature = np.maximum(information, 0.0) / bounded_ratio(smoother.weight_curvature_ratio) + before

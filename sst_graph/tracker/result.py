@@ -49,6 +49,9 @@ def tracker_result(tracker: Tracker, drive: str, camera_name: str) -> Calibratio
         reasons = (*reasons, *_refused(tracker.last_update))
     if last.undecided_sweep:
         reasons = (*reasons, last.undecided_sweep)
+    shifts = estimate.uncertainty.shifts
+    if last.covariance is not None:
+        reasons = (*reasons, *shifts.sentences(last.covariance))
     entries = {} if estimate.smoother is None else estimate.smoother.entries
     used = [FrameId(drive, scan.index) for number, scan in window.scans if number in entries]
     model = None if estimate.smoother is None else estimate.smoother.model
@@ -79,6 +82,7 @@ def tracker_result(tracker: Tracker, drive: str, camera_name: str) -> Calibratio
             "error_model": None
             if model is None
             else {"side": model.side, "side_frame": model.side_frame, "match": model.match},
+            **shifts.diagnostics,
             **({} if config.drift.enabled else {KEY: to_document(estimate.information_log.gained(drive))}),
         },
         versions=package_versions(),

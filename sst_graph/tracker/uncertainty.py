@@ -10,6 +10,7 @@ import numpy as np
 from sst_graph.batch.by_edges.positions import POSITIONS
 from sst_graph.batch.method_estimate import UNKNOWN_SIGMAS
 from sst_graph.covariance.considered import steps_by
+from sst_graph.covariance.image_shifts import ImageShifts
 from sst_graph.errors import EstimationError
 from sst_graph.graph.linear import scaled_inverse
 from sst_graph.tracker.monitor.statistic import ComparedEstimate, EstimateCovariance
@@ -23,8 +24,8 @@ class Uncertainty:
     """Covariance of an estimate, and its parts.
 
     Attributes:
-        joint: cluster-robust covariance of all unknowns.
-        inflation: how much larger it is than that of independent matches.
+        joint: cluster-robust covariance of all unknowns, with what shifts of pictures and stamps add.
+        inflation: how much larger the former is than that of independent matches.
         by_static_objects: (7, 7) covariance of extrinsic and offset by static objects alone; None where no
             object moves.
         steps: (7,) derivative of extrinsic and offset by each parameter of an assumption that is held at 0,
@@ -32,6 +33,8 @@ class Uncertainty:
         edge_steps: (k, 7) step of extrinsic and offset by one deviation of where edges lie between the beams.
         edge_share: (7, k) how extrinsic and offset follow a shift of them as all edges see it; k is 7, or 0
             without edges.
+        shifts: how pictures and stamps shift from image to image, and what of the covariance of extrinsic and
+            offset it is.
     """
 
     joint: EstimateCovariance
@@ -40,6 +43,7 @@ class Uncertainty:
     steps: Mapping[str, FloatArray] = field(default_factory=dict)
     edge_steps: FloatArray = field(default_factory=lambda: np.zeros((0, 7)))
     edge_share: FloatArray = field(default_factory=lambda: np.zeros((7, 0)))
+    shifts: ImageShifts = field(default_factory=ImageShifts.none)
 
     @classmethod
     def nothing(cls) -> Uncertainty:
@@ -69,8 +73,9 @@ class Uncertainty:
         steps = {name: step for name, step in held.items() if name not in EDGE_ERRORS}
         positions = np.array([held[name] for name in POSITIONS if name in held]).reshape(-1, 7)
         share = np.array([-held[name] for name in SHIFTS if name in held]).reshape(-1, 7).T
-        joint = EstimateCovariance(matrix, smoother.past.point.tracks, m)
-        return cls(joint, inflation, by_static_objects, steps, positions, share)
+        shifts, by_shifts = _shifts(smoother, naive)
+        joint = EstimateCovariance(matrix + by_shifts, smoother.past.point.tracks, m)
+        return cls(joint, inflation, by_static_objects, steps, positions, share, shifts)
 
     def compared(self, smoother: WindowSmoother, variance_ratio: float) -> ComparedEstimate:
         """A smoother's estimate with this covariance, for the comparison of frames with it."""
@@ -82,3 +87,15 @@ class Uncertainty:
         """(m, m) covariance of extrinsic, offset, mask biases and estimated parameters."""
         m = self.joint.core_size
         return self.joint.matrix[:m, :m]
+
+
+def _shifts(smoother: WindowSmoother, naive: FloatArray) -> tuple[ImageShifts, FloatArray]:
+    """Shifts of pictures and stamps from image to image, and (n, n) what they add to the covariance.
+
+    Args:
+        naive: (n, n) covariance of independent matches.
+    """
+    n = len(naive)
+    variances, excess = smoother.shift_excess()
+    parts = naive @ excess[:, :n, :n] @ naive
+    return ImageShifts(np.sqrt(variances), parts[:, :7, :7]), np.asarray(parts.sum(axis=0))

@@ -105,7 +105,8 @@ def _score(rng: np.random.Generator, truth: FloatArray, side: int) -> Linearized
     point = Point(gtsam.Pose3(), 0.0, np.zeros(2))
     information = Gaussian(point, J.T @ J, -J.T @ r)
     scores = ScoreSums.of_frame(J, ones, side + which, LevelEdges.none(200))
-    return LinearizedPair(information, information, scores, residuals, 200)
+    nothing = np.zeros((N, 3))
+    return LinearizedPair(information, information, scores, residuals, 200, by_shifts=nothing)
 
 
 def _model() -> ErrorModel:

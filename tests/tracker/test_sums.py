@@ -12,13 +12,14 @@ from sst_graph.covariance.cluster_robust import (
     robust_covariance,
     steps_without_objects,
 )
+from sst_graph.covariance.image_shifts import columns_by_image, shifts_of
 from sst_graph.covariance.jackknife import ObjectSpread, composed
 from sst_graph.drive.preparation import PrepareConfig, prepare_drive
 from sst_graph.factors import RobustKernel
 from sst_graph.graph.building import joint_graph
 from sst_graph.graph.drive_motion import motions_of
 from sst_graph.graph.linear import unit_scale
-from sst_graph.graph.matching import GraphConfig, associate
+from sst_graph.graph.matching import GraphConfig, PairMatches, associate
 from sst_graph.graph.state import EXTRINSIC, State, bias_key, object_bias_key, time_offset_key
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.simulator import SimulationConfig
@@ -33,7 +34,7 @@ VEHICLE, CONFIG, OFFSET_S = SemanticClass.VEHICLE, GraphConfig(), 0.03
 
 
 @pytest.fixture(scope="module")
-def matched() -> tuple[RobustCovariance, Point, list[LinearizedPair]]:
+def matched() -> tuple[RobustCovariance, list[PairMatches], Point, list[LinearizedPair]]:
     """The batch's covariance of six frames at the truth, and the same frames as a tracker linearizes them."""
     street = simulated(
         SimulationConfig(
@@ -56,7 +57,7 @@ def matched() -> tuple[RobustCovariance, Point, list[LinearizedPair]]:
     point = Point.unbiased(state.cTl, OFFSET_S, [VEHICLE]).seen(seen)
     named = [{(c, n): track for (k, c, n), track in tracks.items() if k == pair.pair.scan} for pair in pairs]
     linear = linearize_pairs(pairs, point, [PairColumns([VEHICLE], own) for own in named])
-    return robust, point, linear
+    return robust, pairs, point, linear
 
 
 def _columns(robust: RobustCovariance, point: Point) -> NDArray[np.intp]:
@@ -71,10 +72,10 @@ def _columns(robust: RobustCovariance, point: Point) -> NDArray[np.intp]:
 
 @pytest.mark.parametrize("left", [0, 3, 6])
 def test_the_sums_are_the_batch_s(
-    matched: tuple[RobustCovariance, Point, list[LinearizedPair]], left: int
+    matched: tuple[RobustCovariance, list[PairMatches], Point, list[LinearizedPair]], left: int
 ) -> None:
     """Wherever the frames are: in the window, or gone from it."""
-    robust, point, linear = matched
+    robust, _, point, linear = matched
     columns, sums = _columns(robust, point), RunningSums.empty(point.size)
     of_pairs = [point.columns(pair.information.point.tracks) for pair in linear]
     for scan in range(left):
@@ -111,10 +112,33 @@ def test_the_sums_are_the_batch_s(
     np.testing.assert_allclose(found / both, batch / both, atol=0.02)
 
 
-def test_parts_of_frames_are_compared_as_each_by_itself(
-    matched: tuple[RobustCovariance, Point, list[LinearizedPair]],
+@pytest.mark.parametrize("left", [0, 3, 6])
+def test_shifts_from_image_to_image_are_the_batch_s(
+    matched: tuple[RobustCovariance, list[PairMatches], Point, list[LinearizedPair]], left: int
 ) -> None:
-    _, point, linear = matched
+    robust, pairs, point, linear = matched
+    columns, sums = _columns(robust, point), RunningSums.empty(point.size)
+    of_pairs = [point.columns(pair.information.point.tracks) for pair in linear]
+    for scan in range(left):
+        sums.add(linear[scan], of_pairs[scan], scan)
+    variances, excess = sums.shift_excess(linear[left:], of_pairs[left:])
+    state = State(point.cTl, (OFFSET_S,))
+    values = joint_graph(pairs, state, CONFIG)[1]
+    by_image = columns_by_image(robust.table, pairs, values, state)
+    batch = shifts_of(robust.table, robust.bread, *by_image)
+    assert batch.sigmas.max() > 0.0
+    np.testing.assert_allclose(np.sqrt(variances), batch.sigmas, rtol=1e-7)
+    found = robust.bread @ excess[:, columns[:, None], columns] @ robust.bread
+    scale = unit_scale(batch.covariance)
+    np.testing.assert_allclose(
+        found * np.outer(scale, scale), batch.parts * np.outer(scale, scale), atol=1e-7
+    )
+
+
+def test_parts_of_frames_are_compared_as_each_by_itself(
+    matched: tuple[RobustCovariance, list[PairMatches], Point, list[LinearizedPair]],
+) -> None:
+    _, _, point, linear = matched
     model = RunningSums.empty(point.size).error_model(linear)
     covariance = EstimateCovariance(1e-6 * np.eye(point.size), point.tracks, point.core_size)
     known = ComparedEstimate(point, covariance, model)

@@ -10,6 +10,7 @@ import numpy as np
 
 from sst_graph.association.edge_matching import SIDES
 from sst_graph.covariance.error_model import SideResiduals
+from sst_graph.covariance.image_shifts import NO_MOMENTS, shift_moments
 from sst_graph.covariance.level_edges import LevelEdges
 from sst_graph.covariance.match_table import curvatures_of, unweighted
 from sst_graph.covariance.static_objects import dynamic_matches
@@ -21,7 +22,7 @@ from sst_graph.graph.matching import PairMatches
 from sst_graph.tracker.sums.object_sums import ObjectInformation
 from sst_graph.tracker.sums.rows import PairAt, PairColumns, Rows, rows_of_pairs
 from sst_graph.tracker.window.gaussian import Gaussian, Point
-from sst_graph.types import FloatArray
+from sst_graph.types import FloatArray, SemanticClass
 
 _LEAST_CURVATURE = 0.2
 """Least mean curvature, over the mean weight, in the observed information: it stays positive where most
@@ -44,6 +45,10 @@ class LinearizedPair:
         objects: the matches object by object.
         weight, curvature: sums of the matches' weights, and of the robust loss's second derivatives.
         static: the information by static objects alone, where some are dynamic with a known velocity.
+        shifts: (3, 7) moments of the shifts of the picture and of its stamp
+            (:func:`~sst_graph.covariance.image_shifts.shift_moments`).
+        by_shifts: (n, 3) what a unit of each does to the score, in the columns of the Gaussian, what it holds
+            included.
     """
 
     information: Gaussian
@@ -56,6 +61,8 @@ class LinearizedPair:
     weight: float = 1.0
     curvature: float = 1.0
     static: Gaussian | None = None
+    shifts: FloatArray = field(default_factory=NO_MOMENTS.copy)
+    by_shifts: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
     @property
     def by_static_objects(self) -> Gaussian:
@@ -117,6 +124,8 @@ def _linearized(
     track = np.concatenate([at.columns.tracks_of(pair, c) for c in pair.matches])
     side = track * SIDES + np.concatenate([m.sides for m in pair.matches.values()])
     own = roots / np.sqrt(share)
+    # Of labels alone: edges have a covariance of their own.
+    of_shifts = np.column_stack([rows.by_picture, J[:, 6]]) * (SemanticClass.OBJECT not in pair.matches)
     level = [LevelEdges.of(each.alignment, each.level_px, pair.wTl) for each in pair.matches.values()]
     scores = ScoreSums.of_frame(J, roots, side, LevelEdges.joined(level))
     return LinearizedPair(
@@ -131,6 +140,8 @@ def _linearized(
         weight,
         curvature,
         _by_static_objects(pair, point, A[:, known], motion[np.ix_(known, known)]),
+        shift_moments(of_shifts / np.sqrt(share), r / np.sqrt(share), side),
+        J.T @ of_shifts,
     )
 
 

@@ -88,12 +88,14 @@ class Rows:
     Attributes:
         J: (m, n) by the unknowns and what is held.
         by_twist: (m, 6) by the camera's twist.
+        by_picture: (m, 2) by a shift of the picture across and down.
         residuals: (m,) weighted.
         roots: (m,) of the robust weights.
     """
 
     J: FloatArray
     by_twist: FloatArray
+    by_picture: FloatArray
     residuals: FloatArray
     roots: FloatArray
 
@@ -129,6 +131,7 @@ def _of_class(pairs: Sequence[PairAt], c: SemanticClass) -> list[Rows]:
         base_taus_s = np.repeat([one.pair.pair.base_tau_s for one in pairs], counts)
         at, scene = (point.cTl, point.time_offset_s, twists.T), _scene(pairs, counts)
         known = columns_of_jacobian(J, alignment, scene, base_taus_s, at, assumptions)
+    by_picture = J[:, 13:14] * alignment.normals
     ends = np.cumsum(counts).tolist()
     found = []
     for one, places, start, end in zip(pairs, columns, [0, *ends], ends, strict=False):
@@ -142,7 +145,7 @@ def _of_class(pairs: Sequence[PairAt], c: SemanticClass) -> list[Rows]:
         if held and c == SemanticClass.OBJECT:
             errors = edge_error_columns(J[some], one.pair.matches[c], one.columns.config)
             block[:, point.size + len(assumptions) :] = errors
-        found.append(Rows(block, J[some, 7:13], r[some], roots[some]))
+        found.append(Rows(block, J[some, 7:13], by_picture[some], r[some], roots[some]))
     return found
 
 

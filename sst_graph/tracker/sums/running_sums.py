@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sst_graph.covariance.error_model import ErrorModel, SideResiduals, fit_error_model
+from sst_graph.covariance.image_shifts import NO_MOMENTS, shift_variances
 from sst_graph.covariance.jackknife import curvature_ratio
 from sst_graph.covariance.sums import ScoreSums, total
 from sst_graph.tracker.sums.linearized_pair import LinearizedPair
@@ -35,6 +36,8 @@ class RunningSums:
         objects: the matches object by object.
         weight, curvature: sums over all matches, see :class:`LinearizedPair`.
         held: number of held parameters.
+        shifts: (3, 7) moments of the shifts of pictures and stamps, see :class:`LinearizedPair`.
+        by_shifts: (3, n, n) variance of the score, held parameters included, by a unit of each in all images.
     """
 
     scores: ScoreSums
@@ -44,11 +47,14 @@ class RunningSums:
     weight: float = 0.0
     curvature: float = 0.0
     held: int = 0
+    shifts: FloatArray = field(default_factory=NO_MOMENTS.copy)
+    by_shifts: FloatArray = field(default_factory=lambda: np.zeros((3, 0, 0)))
 
     @classmethod
     def empty(cls, n: int, held: int = 0) -> RunningSums:
         """n: unknowns; held: further parameters."""
-        return cls(ScoreSums.none(n + held), objects=ObjectSums.empty(n), held=held)
+        nothing = np.zeros((3, n + held, n + held))
+        return cls(ScoreSums.none(n + held), objects=ObjectSums.empty(n), held=held, by_shifts=nothing)
 
     @property
     def size(self) -> int:
@@ -73,6 +79,8 @@ class RunningSums:
         if by_object and pair.objects is not None:
             self.objects.add(pair.objects)
         self.weight, self.curvature = self.weight + pair.weight, self.curvature + pair.curvature
+        self.shifts = self.shifts + pair.shifts
+        self.by_shifts = self.by_shifts + _squares([pair], [columns], n)
 
     def weight_curvature_ratio(self, window: Sequence[LinearizedPair] = ()) -> float:
         """Mean robust weight over mean curvature, of all matches."""
@@ -86,6 +94,7 @@ class RunningSums:
     def transform(self, T: FloatArray) -> None:
         """Follow the Gaussian: through a random walk (:meth:`Gaussian.transition`), or to other unknowns."""
         self.scores = self.scores.transformed(T)
+        self.by_shifts = T @ self.by_shifts @ T.T
         self.objects.transform(T[: len(T) - self.held, : T.shape[1] - self.held])
 
     def copy(self) -> RunningSums:
@@ -113,3 +122,24 @@ class RunningSums:
         n = self.size + self.held
         every = total(n, [self.scores, *(pair.scores for pair in window)], [np.arange(n), *columns])
         return (every if with_held else every.columns(slice(self.size))).excess(model)
+
+    def shift_excess(
+        self, window: Sequence[LinearizedPair], columns: Sequence[IntArray]
+    ) -> tuple[FloatArray, FloatArray]:
+        """(3,) variances of the shifts of pictures [px^2, px^2] and of their stamps [s^2], and (3, n, n) what
+        each adds to the variance of the score, over the held parameters, too.
+
+        Args:
+            window, columns: as of :meth:`excess`.
+        """
+        variances = shift_variances(sum((pair.shifts for pair in window), self.shifts))
+        squares = self.by_shifts + _squares(window, columns, self.size + self.held)
+        return variances, variances[:, None, None] * squares
+
+
+def _squares(pairs: Sequence[LinearizedPair], columns: Sequence[IntArray], n: int) -> FloatArray:
+    """(3, n, n) variance of the score of some pairs, each in its own columns, by a unit of each shift."""
+    rows = np.zeros((3, len(pairs), n))
+    for k, (pair, own) in enumerate(zip(pairs, columns, strict=True)):
+        rows[:, k, own] = pair.by_shifts[: len(own)].T
+    return np.asarray(rows.transpose(0, 2, 1) @ rows)

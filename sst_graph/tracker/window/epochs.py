@@ -100,10 +100,15 @@ class EpochSums:
         columns = self.information.point.columns(pair.information.point.tracks)
         self.sums.add(pair, columns, scan, by_object=False)
 
-    def retired(self, start_ns: int, model: ErrorModel) -> RetiredEpoch:
-        """The epoch without its objects' biases, which are marginalized out."""
+    def retired(self, start_ns: int, model: ErrorModel, shift_variances: FloatArray) -> RetiredEpoch:
+        """The epoch without its objects' biases, which are marginalized out.
+
+        Args:
+            shift_variances: (3,) of the shifts of pictures and their stamps, from image to image.
+        """
         H = self.information.information
         variance = H + self.sums.excess([], [], model)
         excess = composed(variance, None, self.sums.weight_curvature_ratio()) - H
+        excess = excess + np.tensordot(shift_variances, self.sums.by_shifts, axes=1)
         information, T = self.information.without(self.information.point.tracks)
         return RetiredEpoch(start_ns, information, T @ excess @ T.T)

@@ -29,11 +29,12 @@ from sst_graph.graph.state import (
 )
 from sst_graph.tracker.config import DriftConfig
 from sst_graph.tracker.sums.held import held_names
+from sst_graph.tracker.sums.linearized_pair import LinearizedPair
 from sst_graph.tracker.sums.running_sums import RunningSums
 from sst_graph.tracker.window.epochs import Epoch, EpochSums, MatchedPair, RetiredEpoch
 from sst_graph.tracker.window.gaussian import Gaussian, Point, insert_point, inverted
 from sst_graph.tracker.window.smoother_update import SmootherUpdate, TwistFactor, read_point
-from sst_graph.types import FloatArray, SemanticClass
+from sst_graph.types import FloatArray, IntArray, SemanticClass
 
 _RELINEARIZE = {
     "E": np.repeat([2e-4, 1e-3], 3),
@@ -362,9 +363,17 @@ class WindowSmoother:
         Args:
             with_held: over the held parameters of ``past``, too.
         """
+        return self.sums.excess(*self._window_columns(), self.model, with_held)
+
+    def shift_excess(self) -> tuple[FloatArray, FloatArray]:
+        """(3,) variances of the shifts of pictures and of their stamps, and (3, n, n) what each adds to the
+        variance of the score (:meth:`RunningSums.shift_excess`)."""
+        return self.sums.shift_excess(*self._window_columns())
+
+    def _window_columns(self) -> tuple[list[LinearizedPair], list[IntArray]]:
+        """The pairs of the window, and the columns of each in ``past``."""
         window, point = [entry.linear for entry in self.entries.values()], self.past.point
-        columns = [point.columns(pair.information.point.tracks, self.past.held) for pair in window]
-        return self.sums.excess(window, columns, self.model, with_held)
+        return window, [point.columns(pair.information.point.tracks, self.past.held) for pair in window]
 
     @property
     def weight_curvature_ratio(self) -> float:
@@ -380,11 +389,11 @@ class WindowSmoother:
 
     def live_epochs(self) -> list[RetiredEpoch]:
         """Epochs of the window, as if they retired now."""
-        found = []
+        found, (shift_variances, _) = [], self.shift_excess()
         for i, epoch in enumerate(self.epochs):
             sums = self.epoch_sums.copy() if i == 0 else EpochSums.empty(self.past.point)
             for scan, entry in self.entries.items():
                 if entry.epoch == epoch.number:
                     sums.add(entry.linear, scan, self.graph.object_bias_sigma_px)
-            found.append(sums.retired(epoch.start_ns, self.model))
+            found.append(sums.retired(epoch.start_ns, self.model, shift_variances))
         return found
