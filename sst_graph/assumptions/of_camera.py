@@ -111,5 +111,6 @@ K2 = replace(
     effect=_k2,
     prevalence=0.02,
     by_edges=False,
-    remedy=K1.remedy.replace("k1", "k2"),
+    # A lens that bends by r^4 bends by r^2: with k1 held at zero, k2 alone takes up a part of it.
+    remedy=K1.remedy.replace("k1", "k1,k2"),
 )

@@ -69,13 +69,40 @@ def require_labels(sources: Sequence[Source], method: str) -> None:
     Raises:
         DataError: no scan of any drive has labels, or no image; or a frame that cannot be read.
     """
+    _refuse(sources, method, _missing(sources, method))
+
+
+def require_labels_of_a_camera(cameras: Sequence[Sequence[Source]], method: str) -> None:
+    """The same of one camera of a rig at least.
+
+    Raises:
+        DataError: no camera has what the method needs; or a frame that cannot be read.
+    """
+    missing: list[str] = []
+    for own in cameras:
+        missing = _missing(own, method)
+        if not missing:
+            return
+    _refuse(cameras[0], method, missing)
+
+
+def _missing(sources: Sequence[Source], method: str) -> list[str]:
+    """What labels a method needs and no drive has.
+
+    Raises:
+        DataError: a frame that cannot be read.
+    """
     if method not in METHODS_BY_LABELS or any(getattr(one, "labelling", None) is not None for one in sources):
-        return
+        return []
     missing = []
     if not any(_any_labels(scan_positions(one), partial(scan_at, one)) for one in sources):
         missing.append("labels of points")
     if not any(_any_labels(image_positions(one), partial(image_at, one)) for one in sources):
         missing.append("semantic masks of images")
+    return missing
+
+
+def _refuse(sources: Sequence[Source], method: str, missing: Sequence[str]) -> None:
     if missing:
         raise DataError(
             ", ".join(source.name for source in sources),

@@ -56,7 +56,7 @@ def likely_causes(
     if cause is None and guess.cTl is not None:
         cause = wrong_start(guess.cTl, fit(drive, Guess(None, guess.time_offset_s)))
     best = max(0.0 if one is None else one.quality for one in (given, result))
-    if cause is None and best < LEAST_QUALITY:
+    if cause is None and best < LEAST_QUALITY and any(image.contours for image in drive.images):
         cause = _nothing_in_common(given)
     return () if cause is None else (cause,)
 

@@ -57,7 +57,8 @@ def parse_yaml(text: str, place: str | Path) -> dict[str, Any]:
         found = said_of_values(error) if isinstance(error, ValueError) else one_line(error)
         raise DataError(place, f"no YAML ({found:.200})", "numbers, text, lists and tables") from None
     if not isinstance(value, dict):
-        raise DataError(place, f"a YAML {type(value).__name__}", "a table")
+        found = "nothing" if value is None else f"a YAML {type(value).__name__}"
+        raise DataError(place, found, "a table")
     return value
 
 

@@ -24,7 +24,11 @@ from sst_graph.batch.method_estimate import UNKNOWN_SIGMAS, MethodEstimate, qual
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.batch.sources import as_sources
 from sst_graph.config import expect_settings, to_dict
-from sst_graph.covariance.observability import open_directions, reasons_of
+from sst_graph.covariance.observability import (
+    involves_offset,
+    open_directions,
+    reasons_of,
+)
 from sst_graph.covariance.shared_errors import SharedErrors
 from sst_graph.drive.further_camera import with_camera
 from sst_graph.drive.preparation import Drive, Progress, check_progress
@@ -35,7 +39,7 @@ from sst_graph.floating_point import with_usual_errors
 from sst_graph.graph.outer_loop import KERNELS_PX
 from sst_graph.graph.state import State
 from sst_graph.quality.fit_of_solution import has_edges
-from sst_graph.result import CalibrationResult, Status
+from sst_graph.result import CalibrationResult, Status, WeakDirection
 from sst_graph.rig.adjustment import (
     ComparedPose,
     ComparedTrigger,
@@ -295,10 +299,13 @@ class _Rig:
 
     def _covariance(self, name: str) -> FloatArray:
         """(7, 7) of a camera's own estimate; wide where that is not to be trusted and others know better."""
-        camera, poses = self.cameras[name], self.known.poses
-        linked = self.known.one_trigger or any(name in (p.camera, p.reference) for p in poses)
+        return np.diag(UNKNOWN_SIGMAS**2) if self._set_aside(name) else self.cameras[name].result.covariance
+
+    def _set_aside(self, name: str) -> bool:
+        """Whether a camera's own estimate is not to be trusted and others know better."""
+        linked = self.known.one_trigger or _has_pose(self.known, name)
         others_know = linked and any(other.trusted for other in self.cameras.values())
-        return np.diag(UNKNOWN_SIGMAS**2) if others_know and not camera.trusted else camera.result.covariance
+        return others_know and not self.cameras[name].trusted
 
     @cached_property
     def marginal(self) -> RigMarginal:
@@ -366,8 +373,7 @@ class _Rig:
         }
         static = self._static_covariances()
         results = {
-            name: _camera_result(camera, name, after, static[name], wrong[name], config)
-            for name, camera in self.cameras.items()
+            name: self._camera_result(name, after, static[name], wrong[name], config) for name in self.cameras
         }
         return RigResult(
             results,
@@ -377,6 +383,21 @@ class _Rig:
             self.known,
             self._diagnostics(),
         )
+
+    def _camera_result(
+        self,
+        name: str,
+        after: RigMarginal,
+        static: FloatArray,
+        wrong: Sequence[str],
+        config: CalibrationConfig,
+    ) -> CalibrationResult:
+        """A camera's result after the adjustment, with the sentences that make it wrong."""
+        covariance, cTl = after.of_camera(name), after.extrinsics[after.names.index(name)]
+        weak = open_directions(covariance, static, cTl, config.observability)
+        if self._set_aside(name) or self.cameras[name].estimate is None:
+            weak = _with_advice(weak, self.agreed, name)
+        return _camera_result(self.cameras[name], name, after, weak, wrong)
 
     def _static_covariances(self) -> dict[str, FloatArray]:
         """(7, 7) of each camera by static objects alone, and what is known of the rig."""
@@ -435,6 +456,28 @@ def _pixels(result: CalibrationResult, cTl: gtsam.Pose3) -> float:
     return angle * result.camera.fx
 
 
+def _has_pose(known: KnownRig, name: str) -> bool:
+    """Whether a known pose joins a camera to another one."""
+    return any(name in (pose.camera, pose.reference) for pose in known.poses)
+
+
+_NO_POSE = "give this camera better images or labels, or its pose to another camera (--rig)"
+_NO_OFFSET = "give this camera better images or labels, or, where all are triggered together, --one-trigger"
+"""Advice where a camera has no estimate of its own, or it was set aside."""
+
+
+def _with_advice(weak: Sequence[WeakDirection], agreed: KnownRig, name: str) -> tuple[WeakDirection, ...]:
+    """Weak directions of a camera without an estimate of its own that is used: no record with such images
+    helps in what no other camera tells of it."""
+
+    def advised(direction: WeakDirection) -> WeakDirection:
+        if involves_offset(direction):
+            return direction if agreed.one_trigger else replace(direction, advice=_NO_OFFSET)
+        return direction if _has_pose(agreed, name) else replace(direction, advice=_NO_POSE)
+
+    return tuple(advised(direction) for direction in weak)
+
+
 _FROM_OTHERS = (
     "its own images give no estimate: pose and time offset follow from the other cameras and what is known "
     "of the rig"
@@ -445,14 +488,12 @@ def _camera_result(
     camera: _Camera,
     name: str,
     after: RigMarginal,
-    static: FloatArray,
+    weak: tuple[WeakDirection, ...],
     wrong: Sequence[str],
-    config: CalibrationConfig,
 ) -> CalibrationResult:
-    """A camera's result after the adjustment, with the sentences that make it wrong."""
+    """A camera's result after the adjustment, with its weak directions and what makes it wrong."""
     at, own = after.names.index(name), camera.result
     cTl, covariance = after.extrinsics[at], after.of_camera(name)
-    weak = open_directions(covariance, static, cTl, config.observability)
     not_converged = bool(wrong) or own.status == "not_converged"
     unobservable = bool(weak) or bool(camera.open_sweeps)
     status: Status = "not_converged" if not_converged else "unobservable" if unobservable else "ok"
@@ -461,6 +502,7 @@ def _camera_result(
     if not own.frames_used and status == "ok":
         kept = (_FROM_OTHERS, *kept)
     sentences = (*camera.open_sweeps, *reasons_of(weak))
+    cause_first = not_converged or camera.estimate is None
     alone = {
         "T_camera_lidar": own.T_camera_lidar.matrix().tolist(),
         "time_offset_s": own.time_offset_s,
@@ -476,7 +518,7 @@ def _camera_result(
         covariance=covariance,
         status=status,
         camera_name=name,
-        reasons=(*wrong, *kept, *sentences) if not_converged else (*sentences, *kept),
+        reasons=(*wrong, *kept, *sentences) if cause_first else (*sentences, *kept),
         weak_directions=weak,
         diagnostics={**diagnostics, **quality_of(fit), "by_own_images": alone},
         fit=fit,

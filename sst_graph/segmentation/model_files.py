@@ -107,6 +107,7 @@ def image_model(path: Path, table: Mapping[str, Any]) -> ImageModel:
     Raises:
         DataError: an unknown key, or a value out of its range.
     """
+    _refuse_kind(table, _IMAGE_KEYS, _SCAN_KEYS, path, "scans (--lidar-model)")
     _refuse_others(table, _IMAGE_KEYS, path)
     default = PictureInput()
     values = PictureInput(
@@ -139,6 +140,7 @@ def scan_model(path: Path, table: Mapping[str, Any]) -> ScanModel:
     Raises:
         DataError: an unknown key, or a value out of its range.
     """
+    _refuse_kind(table, _SCAN_KEYS, _IMAGE_KEYS, path, "pictures (--image-model)")
     _refuse_others(table, _SCAN_KEYS, path)
     default = RangeView()
     view = RangeView(
@@ -231,6 +233,16 @@ def _described(path: Path, expected: str) -> Path:
     if os.path.isdir(path) or path.suffix.lower() not in _YAML:
         raise DataError(path, "a folder" if os.path.isdir(path) else f"a file {path.suffix!r:.20}", expected)
     return path
+
+
+def _refuse_kind(
+    table: Mapping[str, Any], keys: tuple[str, ...], of_others: tuple[str, ...], path: Path, others: str
+) -> None:
+    """Refuse the file of a network for the other sensor: it has keys that only these have."""
+    for key in table:
+        if key in of_others and key not in keys:
+            expected = f"some of {', '.join(keys)}; a network for {others} has that key"
+            raise DataError(path, f"the key {key!r:.40}", expected)
 
 
 def _refuse_others(table: Mapping[str, Any], keys: tuple[str, ...], place: str | Path) -> None:

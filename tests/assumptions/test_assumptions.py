@@ -115,6 +115,12 @@ def test_distortion_lays_no_point_from_beside_the_image_into_it(name: str, theta
     assert (uvs[:, 0] + theta * shift[:, 0] > CAMERA.width).all()
 
 
+def test_k2_is_to_be_estimated_with_k1() -> None:
+    """With k1 at zero, k2 alone takes up a part of a lens of k1: of -0.1 on a street, 8 cm off and ok."""
+    assert ASSUMPTIONS["k2"].remedy.endswith("--estimate k1,k2")
+    assert ASSUMPTIONS["k1"].remedy.endswith("--estimate k1")
+
+
 def test_several_parameters_add_up() -> None:
     lPs = points(5)
     uvs = np.tile([700.0, 200.0], (5, 1))

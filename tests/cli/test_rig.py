@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -92,6 +93,50 @@ def test_as_json_with_videos_inside(street: Path, tmp_path: Path, capsys: pytest
     assert {"rig.json", "drive_image_2.gif", "drive_image_3.gif"} < set(document["files"])
     pictures = [(out / file).read_bytes() for file in document["files"] if file.endswith(".gif")]
     assert pictures[0].startswith(b"GIF8") and pictures[0] != pictures[1]
+
+
+@pytest.fixture(scope="module")
+def half_labelled(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The stereo street without the masks of image_3."""
+    folder = tmp_path_factory.mktemp("rig") / "street"
+    shutil.copytree(street, folder)
+    shutil.rmtree(folder / "sequences/00/semantic_3")
+    return folder
+
+
+_FEW = ["--camera", "image_2", "image_3", "--frames", "0:6", "--no-report", "--set", "search.enabled=false"]
+
+
+@pytest.mark.slow
+def test_a_camera_without_masks_leaves_the_others_theirs(
+    half_labelled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By labels it has no estimate of its own, and the other one is that of its masks."""
+    options = [*_FEW, "--method", "joint", "--out", str(tmp_path / "rig")]
+    assert main(["calibrate", str(half_labelled), *options]) == 3
+    assert "image_3: unobservable: no mask's pixel has a label" in capsys.readouterr().err
+    rig = read_rig(tmp_path / "rig")
+    assert rig["image_2"].frames_used and not rig["image_3"].frames_used
+
+
+@pytest.mark.slow
+def test_the_camera_that_makes_all_go_by_edges_is_named(
+    half_labelled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main(["calibrate", str(half_labelled), *_FEW, "--out", str(tmp_path / "rig")])
+    said = "warning: image_3: found no labels, so all cameras are calibrated without them"
+    assert said in capsys.readouterr().err
+
+
+def test_labels_of_no_camera(refused: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Where no camera has masks, method joint is refused."""
+    bare = tmp_path / "street"
+    shutil.copytree(refused, bare)
+    for camera in (2, 3):
+        shutil.rmtree(bare / f"sequences/00/semantic_{camera}")
+    options = ["--camera", "image_2", "image_3", "--method", "joint", "--out", str(tmp_path / "out")]
+    assert main(["calibrate", str(bare), *options]) == 2
+    assert "found no semantic masks of images, expected both for method joint" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

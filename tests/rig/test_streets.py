@@ -21,7 +21,7 @@ from sst_graph.factors import FactorError
 from sst_graph.odometry.sweep.decision import SweepDecision
 from sst_graph.rig import KnownPose, KnownRig, RigMarginal, RigResult, calibrate_rig
 from sst_graph.rig.adjustment import adjusted
-from sst_graph.rig.calibrate import calibrate_rig_prepared, prepare_rig
+from sst_graph.rig.calibrate import _NO_OFFSET, _NO_POSE, calibrate_rig_prepared, prepare_rig
 from sst_graph.simulator import SimulatedDrive, simulate
 from sst_graph.simulator.rig import beside, stereo_pose, with_mounts
 from sst_graph.types import CameraImage, Guess, Scan, SemanticClass
@@ -186,6 +186,12 @@ def test_a_camera_without_masks_has_its_pose_from_the_other() -> None:
     unknown = calibrate_rig_prepared(both, guesses, CalibrationConfig(), KnownRig())
     assert unknown["right"].status == "unobservable" and unknown["left"].status == "ok"
     assert unknown.status == "unobservable"
+    assert unknown["right"].reasons[0].startswith("no frame in which LiDAR and camera both show")
+    # No record with such images helps: the advice is to mend these, or to say what is known of the rig.
+    advice = {direction.advice for direction in unknown["right"].weak_directions}
+    assert advice == {_NO_POSE, _NO_OFFSET}
+    free = calibrate_rig_prepared(both, guesses, CalibrationConfig(), KnownRig(known.poses))["right"]
+    assert [direction.advice for direction in free.weak_directions] == [_NO_OFFSET]
 
 
 @pytest.mark.slow

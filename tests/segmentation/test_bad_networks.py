@@ -131,6 +131,11 @@ BAD_IMAGE_MODELS: dict[str, tuple[Made, str]] = {
     "a FIFO": (fifo, "n.onnx: found a FIFO, expected an ONNX network"),
     "no yaml": (described("a: [1"), "n.yaml: found no YAML"),
     "an unknown key": (colour("colour: rgb\n"), "found the key 'colour', expected some of network, classes"),
+    "a network for scans": (
+        colour("fov_up: 3\n"),
+        "layout, output, outputs, min_score; a network for scans (--lidar-model) has that key",
+    ),
+    "an empty file": (described(""), "n.yaml: found nothing, expected a table"),
     "no classes": (described("network: n.onnx\n"), "n.yaml: found no classes"),
     "an unknown map": (
         described("network: n.onnx\nclasses: pascal\n"),
@@ -253,6 +258,10 @@ BAD_SCAN_MODELS: dict[str, tuple[Made, str]] = {
     "an unknown key": (
         ranged("neighbours: {k: 4}\n"),
         "neighbours: found the key 'k', expected some of count",
+    ),
+    "the file of a network for pictures": (
+        ranged("layout: nhwc\n"),
+        "output_name; a network for pictures (--image-model) has that key",
     ),
     "upside down": (ranged("fov_up: -30\n"), "found a field of view from -25 to -30 deg"),
     "labels that are logits": (ranged("output: labels\n"), "labels of shape (1, 3, 16, 64)"),

@@ -3,7 +3,7 @@ have labels."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -60,6 +60,21 @@ def with_method_for_cameras(
     return replace(config, method="edges" if method == "both" else method)
 
 
+def cameras_without_labels(cameras: Mapping[str, Sequence[Source]]) -> tuple[str, ...]:
+    """The cameras on a LiDAR for which method auto takes edges in the place of labels, by name: a drive of
+    theirs has pictures and no labels.
+
+    Raises:
+        DataError: a frame cannot be read.
+    """
+    first = next(iter(cameras.values()), ())
+    sampled = {
+        name: [_SampledFrames(source, scans) for source, scans in zip(own, first, strict=False)]
+        for name, own in cameras.items()
+    }
+    return tuple(name for name, each in sampled.items() if _without_labels(each))
+
+
 def with_method_of(config: CalibrationConfig, drives: Sequence[Drive]) -> CalibrationConfig:
     """The same, by what drives were prepared for."""
     if config.method != "auto":
@@ -107,10 +122,13 @@ class _SampledFrames:
         return (image for k in places if (image := self._drive.image(k)) is not None)
 
 
+def _without_labels(sampled: Sequence[_SampledFrames]) -> list[_SampledFrames]:
+    return [each for each in sampled if not each.labelled and each.pictures]
+
+
 def _method(sampled: Sequence[_SampledFrames], config: CalibrationConfig) -> Method:
-    without = [each for each in sampled if not each.labelled and each.pictures]
     classes = frozenset(map(int, config.classes))
-    if not without:
+    if not _without_labels(sampled):
         return "joint"
     some_labels = any(each.on_both_sides(classes) for each in sampled)
     return "both" if some_labels and not config.time_offset_per_drive else "edges"
