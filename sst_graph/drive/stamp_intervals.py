@@ -110,6 +110,23 @@ class FrameIntervals:
             self.intervals.append(period + off)
         return None
 
+    def set_clock(self, first_ns: int, stamp_ns: int, place: Place) -> Jump | None:
+        """The clock was set, as stamps from the first on show; the jump, where the period is known.
+
+        Args:
+            stamp_ns: the newest of them.
+            place: where it comes.
+        """
+        newest = max(self._latest, default=first_ns)
+        self._odd, self._again = [], []
+        self._latest.clear()
+        self._latest.append(stamp_ns)
+        if len(self.intervals) < _LEAST:
+            return None
+        period, sigma = self._usual()
+        seconds = 1e-9 * (first_ns - newest) - period
+        return Jump(self.sensor, place, seconds, (seconds / sigma) ** 2)
+
     def _usual(self) -> tuple[float, float]:
         """Period, and the deviation of an interval from it [s]."""
         intervals = np.array(self.intervals)
@@ -168,6 +185,10 @@ class StampMonitor:
     def add_image(self, stamp_ns: int, place: Place) -> None:
         """An image's stamp, as it comes."""
         self._add(self.images.add(stamp_ns, place, self.chi2))
+
+    def set_image_clock(self, first_ns: int, stamp_ns: int, place: Place) -> None:
+        """The camera's clock was set, as stamps from the first to this one show."""
+        self._add(self.images.set_clock(first_ns, stamp_ns, place))
 
     def add_scan(self, stamp_ns: int, place: Place) -> Jump | None:
         """A scan's stamp; a jump that changes the offset, once it is certain."""

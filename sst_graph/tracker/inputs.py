@@ -76,16 +76,30 @@ class StampOrder:
         Raises:
             DataError: it is out of place; those after it may show that the clock was set.
         """
-        newest, elsewhere = self.newest_ns, self._elsewhere
+        newest = self.newest_ns
         if newest is None or self._follows(stamp_ns, newest):
             return 0
-        if elsewhere and not self._follows(stamp_ns, elsewhere[-1]):
+        found = f"a stamp of {stamp_ns} ns"
+        return self.step(stamp_ns, DataError(self.sensor, found, f"one after {newest} ns, by a day at most"))
+
+    def step(self, stamp_ns: int, refusal: DataError) -> int:
+        """By how much the clock was set, as a stamp out of place and those before it show [ns].
+
+        Raises:
+            DataError: the refusal, until they do.
+        """
+        newest, elsewhere = self.newest_ns, self._elsewhere
+        if elsewhere and not _CLOSEST_NS <= stamp_ns - elsewhere[-1] <= FARTHEST_NS:
             elsewhere.clear()
         elsewhere.append(stamp_ns)
-        if len(elsewhere) < _ELSEWHERE:
-            found = f"a stamp of {stamp_ns} ns"
-            raise DataError(self.sensor, found, f"one after {newest} ns, by a day at most")
+        if len(elsewhere) < _ELSEWHERE or newest is None:
+            raise refusal
         return stamp_ns - newest
+
+    @property
+    def first_elsewhere_ns(self) -> int:
+        """The first of the stamps that show that the clock was set [ns]."""
+        return self._elsewhere[0]
 
     def add(self, stamp_ns: int, restarted: bool) -> None:
         """A stamp was used; ``restarted``: the stamps go on from there."""
@@ -204,7 +218,7 @@ class SensorInputs:
         self.image_features = FeatureTracker()
         self.frozen = FrozenSensors()
 
-    def check_image(self, image: CameraImage) -> tuple[CameraImage, int]:
+    def check_image(self, image: CameraImage, time_offset_s: float) -> tuple[CameraImage, int]:
         """The image as it may be used, and by how much its clock was set, 0 if it was not [ns].
 
         Raises:
@@ -212,6 +226,8 @@ class SensorInputs:
         """
         checked = checked_image(image, self.camera)
         clock_step_ns = self.image_order.check(checked.stamp_ns)
+        if not clock_step_ns and (too_late := self._too_late(checked, time_offset_s)):
+            clock_step_ns = self.image_order.step(checked.stamp_ns, too_late)
         if self.image_order.newest_ns is not None and checked.stamp_ns > self.image_order.newest_ns:
             self.frozen.check_image(checked, self.window.wTl)
         return _with_own_arrays(checked), clock_step_ns
@@ -228,17 +244,16 @@ class SensorInputs:
         return _with_own_arrays(checked), clock_step_ns
 
     def add_image(self, image: CameraImage, clock_step_ns: int, estimate: OnlineEstimate) -> None:
-        """Put a checked image's contours into the window.
-
-        Raises:
-            DataError: it comes too late.
-        """
+        """Put a checked image's contours into the window."""
         if clock_step_ns:
             self.window.forget_images_before(self.window.next_image)
-        self._check_lateness(image, estimate.point.time_offset_s)
+            self.stamps.set_image_clock(
+                self.image_order.first_elsewhere_ns, image.stamp_ns, self.window.place
+            )
+        else:
+            self.stamps.add_image(image.stamp_ns, self.window.place)
         self.image_order.add(image.stamp_ns, clock_step_ns != 0)
         self.frozen.add_image(image, self.window.wTl)
-        self.stamps.add_image(image.stamp_ns, self.window.place)
         calibration = self.config.calibration
         features = image_features(self.window.next_image, image, calibration.classes, calibration.image_edges)
         self.window.add_image(features, self._image_motion(image, estimate))
@@ -273,15 +288,16 @@ class SensorInputs:
         alarm = self.config.alarm
         return jump if alarm.enabled and alarm.stamps else None
 
-    def _check_lateness(self, image: CameraImage, time_offset_s: float) -> None:
-        """Refuse an image that is far behind the newest scan in true time."""
+    def _too_late(self, image: CameraImage, time_offset_s: float) -> DataError | None:
+        """The refusal of an image that is far behind the newest scan in true time."""
         newest, images = self.window.last_stamp_ns, self.window.images
         if newest is None or not images:
-            return
+            return None
         late_s = (newest - image.stamp_ns) * 1e-9 - time_offset_s
-        if late_s > self.config.late_s and image.stamp_ns < images[-1].stamp_ns:
-            found = f"one {late_s:.2f} s behind the newest scan"
-            raise DataError("image", found, f"at most {self.config.late_s:g} s")
+        if late_s <= self.config.late_s or image.stamp_ns >= images[-1].stamp_ns:
+            return None
+        found = f"one {late_s:.2f} s behind the newest scan"
+        return DataError("image", found, f"at most {self.config.late_s:g} s")
 
     def _image_motion(self, image: CameraImage, estimate: OnlineEstimate) -> ImagePair | None:
         """What an image shows of the camera's motion: a start by edges needs it, nothing else does."""

@@ -250,7 +250,7 @@ class Tracker:
         """Add an image; the update, which one that was used has only where it is asked for."""
         try:
             # 1. Check the image and its stamp.
-            checked, clock_step_ns = self.inputs.check_image(image)
+            checked, clock_step_ns = self.inputs.check_image(image, self.estimate.point.time_offset_s)
             with Snapshot(self.inputs):
                 # 2. Its contours go into the window.
                 self.inputs.add_image(checked, clock_step_ns, self.estimate)

@@ -52,7 +52,7 @@ def _take(tracker: Tracker, frame: Frame) -> None:
     """Take the frame's image and scan into the window."""
     inputs = tracker.inputs
     if frame.image is not None:
-        image, clock_step_ns = inputs.check_image(frame.image)
+        image, clock_step_ns = inputs.check_image(frame.image, tracker.estimate.point.time_offset_s)
         inputs.add_image(image, clock_step_ns, tracker.estimate)
     if frame.scan is not None:
         scan, clock_step_ns = inputs.check_scan(frame.scan)

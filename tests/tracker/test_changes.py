@@ -153,6 +153,23 @@ def test_stamps_that_jump_against_their_interval_are_an_alarm(
     )
 
 
+@pytest.mark.parametrize("jump_s", [-2.0, -3600.0])
+def test_a_camera_clock_that_was_set_back_is_an_alarm(
+    frames: list[Frame], tmp_path: Path, jump_s: float
+) -> None:
+    """Its images are farther behind than late ones may be; the fifth shows that the clock was set."""
+    tracker, updates = _at_step(EARLY_START, tmp_path), []
+    for frame in frames[STEP:]:
+        assert frame.image is not None
+        image = dataclasses.replace(frame.image, stamp_ns=frame.image.stamp_ns + round(1e9 * jump_s))
+        updates.append(tracker.add(dataclasses.replace(frame, image=image)))
+    assert [update.refused for update in updates[:6]] == [("image",)] * 4 + [()] * 2
+    alarms = [i for i, update in enumerate(updates) if update.alarm]
+    assert len(alarms) == 1 and alarms[0] < 8
+    assert f"image stamps jumped by {1e3 * jump_s:+.0f} ms" in updates[alarms[0]].reason
+    assert tracker.estimate.exists and abs(updates[-1].time_offset_s - 0.03 + jump_s) < 0.03
+
+
 def test_a_jump_before_the_start_empties_the_window(street: SimulatedDrive, frames: list[Frame]) -> None:
     """Frames from before it are of another time offset."""
     tracker = tracker_from_truth(street, dataclasses.replace(EARLY_START, start_scans=30))
