@@ -1,15 +1,19 @@
-"""Pictures that shift against the cloud from image to image, as under a mount that vibrates.
+"""Pictures that shift against the cloud from image to image, as under a mount that vibrates, and stamps of
+images that jitter.
 
     OMP_NUM_THREADS=1 python -m studies.shaking_pictures
 
 Pictures and masks of simulated streets are moved by an amount of their own, normally distributed, half as far
-across as up or down. Estimated by labels; NEES (of 7) and the largest error over its deviation of results
-that are ``ok``, without the part of the covariance by such shifts and with it.
+across as up or down; or the stamps of images are. By labels, with ``calibrate`` and, over the same frames,
+with the tracker: medians of NEES (of 7), and the largest error over its deviation, without the part of the
+covariance by such shifts and with it. Of ``calibrate`` results that are ``ok``; of the tracker all, for in so
+few frames hardly one is confirmed.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -18,18 +22,20 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph import CalibrationConfig
+from sst_graph import CalibrationConfig, Tracker, TrackerConfig
 from sst_graph.batch.calibrate import finished, joint_method, prepare_drives
-from sst_graph.covariance.image_shifts import image_shifts
+from sst_graph.covariance.image_shifts import ImageShifts, image_shifts
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.experiments.starts import error_of
+from sst_graph.odometry.sweep import with_sweep
 from sst_graph.types import Guess
 from studies.edges_streets import source_of, start_step
 from studies.subtle_faults import with_numbered_images
 
 FloatArray = NDArray[np.float64]
 STREETS = (*(f"own-{seed}" for seed in range(600, 604)), *(f"third-{seed}" for seed in range(610, 614)))
-SIZES_PX = (0.0, 1.0, 2.0)
+CASES = ((0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (0.0, 10.0))
+"""Deviation of the pictures, up or down [px], and of the stamps [ms]."""
 
 
 def shaken(drive: KeptDrive, pixels: float, seed: int) -> KeptDrive:
@@ -52,13 +58,29 @@ def shaken(drive: KeptDrive, pixels: float, seed: int) -> KeptDrive:
     )
 
 
+def jittered(drive: KeptDrive, milliseconds: float, seed: int) -> KeptDrive:
+    """Each image stamped by an error of its own."""
+    late_ns = 1e6 * milliseconds * np.random.default_rng(seed).normal(size=len(drive.frames))
+    return with_numbered_images(
+        drive, lambda k, image: replace(image, stamp_ns=image.stamp_ns + round(late_ns[k]))
+    )
+
+
 class Outcome(NamedTuple):
-    """Status, shifts found [px], and of the covariances without and with them: NEES, largest error."""
+    """Status, shifts found [px, px, ms]; of the covariances without and with them: NEES, largest error."""
 
     status: str
-    sigmas_px: FloatArray
+    found: FloatArray
     nees: FloatArray
     worst: FloatArray
+
+    @classmethod
+    def of(cls, status: str, error: FloatArray, shifts: ImageShifts, covariance: FloatArray) -> Outcome:
+        """error: (7,) of extrinsic and time offset; covariance: (7, 7) with the shifts."""
+        both = covariance - shifts.covariance[:7, :7], covariance
+        nees = np.array([float(error @ np.linalg.solve(C, error)) for C in both])
+        worst = np.array([np.abs(error / np.sqrt(np.diag(C))).max() for C in both])
+        return cls(status, shifts.sigmas * [1.0, 1.0, 1e3], nees, worst)
 
 
 def outcome_of(drive: KeptDrive, start: gtsam.Pose3) -> Outcome:
@@ -71,35 +93,56 @@ def outcome_of(drive: KeptDrive, start: gtsam.Pose3) -> Outcome:
     solved = estimate.solved.estimate
     last = solved.solution
     shifts = image_shifts(solved.robust, last.pairs, last.values, last.state)
-    error = error_of(result.calibration, truth)
-    covariances = result.covariance - shifts.covariance[:7, :7], result.covariance
-    nees = np.array([float(error @ np.linalg.solve(C, error)) for C in covariances])
-    worst = np.array([np.abs(error / np.sqrt(np.diag(C))).max() for C in covariances])
-    return Outcome(result.status, shifts.sigmas_px, nees, worst)
+    return Outcome.of(result.status, error_of(result.calibration, truth), shifts, result.covariance)
+
+
+def tracked(drive: KeptDrive, start: gtsam.Pose3) -> Outcome:
+    """Of one drive by the tracker, against its truth."""
+    assert drive.truth is not None
+    drive = with_sweep(drive, True)
+    tracker = Tracker(drive.camera, TrackerConfig(), start, sweep=drive.sweep_decision)
+    for frame in drive:
+        tracker.add(frame)
+    last = tracker.optimize()
+    error, shifts = error_of(last.calibration, drive.truth), tracker.estimate.uncertainty.shifts
+    assert last.covariance is not None
+    return Outcome.of(last.status, error, shifts, last.covariance)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("names", nargs="*", default=STREETS)
     names = parser.parse_args().names
-    print("| moved [px] | ok | found across, down [px] | NEES without, with | worst error [sigma] |")
-    print("|---|---|---|---|---|")
-    for pixels in SIZES_PX:
-        found = []
+    print("| pictures [px], stamps [ms] | by | ok | found across, down [px], stamps [ms] | NEES | worst |")
+    print("|---|---|---|---|---|---|")
+    for pixels, milliseconds in CASES:
+        by_all, by_tracker = [], []
         for name in names:
-            source = source_of(name)
-            drive = shaken(KeptDrive.of(source), pixels, int(name.partition("-")[2]))
+            source, seed = source_of(name), int(name.partition("-")[2])
+            drive = KeptDrive.of(source)
+            drive = shaken(drive, pixels, seed) if pixels else drive
+            drive = jittered(drive, milliseconds, seed) if milliseconds else drive
             assert source.truth is not None
-            found.append(outcome_of(drive, source.truth.cTl.retract(start_step(name))))
-        trusted = [each for each in found if each.status == "ok"]
-        shifts = np.median([each.sigmas_px for each in found], axis=0)
-        nees = np.median([each.nees for each in trusted], axis=0)
-        worst = np.max([each.worst for each in trusted], axis=0)
-        print(
-            f"| {pixels:g} | {len(trusted)} of {len(found)} | {shifts[0]:.2f}, {shifts[1]:.2f} | "
-            f"{nees[0]:.1f}, {nees[1]:.1f} | {worst[0]:.1f}, {worst[1]:.1f} |",
-            flush=True,
-        )
+            start = source.truth.cTl.retract(start_step(name))
+            by_all.append(outcome_of(drive, start))
+            by_tracker.append(tracked(drive, start))
+        print(_row(pixels, milliseconds, "calibrate", by_all, [one for one in by_all if one.status == "ok"]))
+        print(_row(pixels, milliseconds, "tracker", by_tracker, by_tracker), flush=True)
+
+
+def _row(
+    pixels: float, milliseconds: float, by: str, outcomes: Sequence[Outcome], counted: Sequence[Outcome]
+) -> str:
+    """counted: those whose errors are."""
+    ok = sum(one.status == "ok" for one in outcomes)
+    across, down, late_ms = np.median([one.found for one in outcomes], axis=0)
+    nees = np.median([one.nees for one in counted], axis=0)
+    worst = np.max([one.worst for one in counted], axis=0)
+    return (
+        f"| {pixels:g}, {milliseconds:g} | {by} | {ok} of {len(outcomes)} | "
+        f"{across:.2f}, {down:.2f}, {late_ms:.1f} | {nees[0]:.1f}, {nees[1]:.1f} | "
+        f"{worst[0]:.1f}, {worst[1]:.1f} σ |"
+    )
 
 
 if __name__ == "__main__":

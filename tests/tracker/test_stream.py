@@ -12,6 +12,7 @@ from streets import EARLY_START, saved_tracker, sigmas_apart, tracker_from_truth
 
 from sst_graph import Tracker
 from sst_graph.covariance.cluster_robust import robust_covariance
+from sst_graph.covariance.image_shifts import image_shifts
 from sst_graph.errors import DataError, EstimationError
 from sst_graph.factors import FactorError
 from sst_graph.graph.building import joint_graph, state_from
@@ -61,8 +62,11 @@ def test_the_covariance_is_the_batch_s(running: Path) -> None:
     graph, values = joint_graph(pairs, state, config)
     values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     state = state_from(values, state, pairs)
-    expected = robust_covariance(graph, values, pairs, state, [tracks]).matrix
-    ratio = np.sqrt(np.diag(tracker.estimate.covariance)[:7] / np.diag(expected)[:7])
+    robust = robust_covariance(graph, values, pairs, state, [tracks])
+    shifts = image_shifts(robust, pairs, values, state)
+    assert shifts.sigmas.any()
+    expected = robust.matrix[:7, :7] + shifts.covariance
+    ratio = np.sqrt(np.diag(tracker.estimate.covariance)[:7] / np.diag(expected))
     np.testing.assert_allclose(ratio, 1.0, atol=0.02)
 
 

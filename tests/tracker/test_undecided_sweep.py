@@ -21,9 +21,12 @@ from sst_graph.odometry.sweep import SweepDecision, SweepTiming, SweptSource, wi
 TIMING = SweepTiming(0.0, -np.pi, 0.1)
 BOTH = (replace(TIMING, fraction=-1.0), replace(TIMING, fraction=1.0))
 OPEN = SweepDecision("undecided", TIMING, 0.1, 0.4, others=BOTH)
-SLOW = replace(streets.SHORT_STREET, speed_mps=2.0)
+SLOW = replace(streets.SHORT_STREET, speed_mps=1.7)
 """In a narrow view too slow a drive to show whether it is compensated."""
-SOON = [word for setting in streets.SOON for word in ("--set", setting)]
+WIDE = ["observability.time_offset_s=0.1", "observability.translation_m=0.2"]
+"""It determines the time offset to some 10 ms, the translation to some 5 cm, with an open sweep or without."""
+SOON = [*streets.SOON, *(f"calibration.{setting}" for setting in WIDE)]
+OPTIONS = [word for setting in SOON for word in ("--set", setting)]
 
 
 def test_the_mean_square_of_the_changes_is_added_and_said_where_it_matters() -> None:
@@ -48,7 +51,7 @@ def test_tracker_and_batch_agree_about_it(tmp_path: Path) -> None:
     assert decision.kind == "undecided" and len(decision.others) == 2
     trackers = []
     for of_sweep in (None, decision):
-        config = with_overrides(TrackerConfig(), streets.SOON)
+        config = with_overrides(TrackerConfig(), SOON)
         tracker = Tracker(drive.camera, config, drive.nominal, sweep=of_sweep)
         lines = [tracker.add(frame) for frame in drive]
         trackers.append((tracker, lines, tracker.optimize()))
@@ -60,14 +63,13 @@ def test_tracker_and_batch_agree_about_it(tmp_path: Path) -> None:
     result = tracker.result()
     assert result.status == "unobservable" and result.reasons == (last.undecided_sweep,)
     # As much as the batch finds by solving again.
-    settings = with_overrides(CalibrationConfig(), ["search.enabled=false", "use_motion=never"])
+    settings = with_overrides(CalibrationConfig(), ["search.enabled=false", "use_motion=never", *WIDE])
     batch = calibrate(source, drive.nominal, settings)
     alone = calibrate(SweptSource(drive, SweepDecision("given", TIMING)), drive.nominal, settings)
     by_batch = np.sqrt(np.diag(batch.covariance - alone.covariance))
-    # Half of a sigma is the border, and stamps that seem to jitter are in the batch's, too.
     share = float((by_batch / np.sqrt(np.diag(batch.covariance))).max())
-    says = any("it matters" in reason for reason in batch.reasons)
-    assert share > 0.4 and says == (share > MATTERS) == (batch.status == "unobservable")
+    assert share > MATTERS and batch.status == "unobservable"
+    assert any("it matters" in reason for reason in batch.reasons)
     by_tracker = np.sqrt(np.diag(last.covariance - plain.covariance))
     # Forward and time offset, which a sweep at constant speed moves, and yaw.
     np.testing.assert_allclose(by_tracker[[2, 3, 6]], by_batch[[2, 3, 6]], rtol=0.5)
@@ -89,7 +91,7 @@ def test_no_line_of_track_is_ok_where_the_sweep_is_open(
 ) -> None:
     out = tmp_path / "calibration.json"
     for how, code in ((["--sweep", "auto"], 3), (["--sweep", "compensated"], 0)):
-        assert main(["track", str(written(SLOW)), *SOON, *how, "--out", str(out), "--overwrite"]) == code
+        assert main(["track", str(written(SLOW)), *OPTIONS, *how, "--out", str(out), "--overwrite"]) == code
         lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
         result = json.loads(out.read_text())
         (sweep,) = result["diagnostics"]["sweep"].values()

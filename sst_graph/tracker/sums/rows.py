@@ -131,6 +131,7 @@ def _of_class(pairs: Sequence[PairAt], c: SemanticClass) -> list[Rows]:
         base_taus_s = np.repeat([one.pair.pair.base_tau_s for one in pairs], counts)
         at, scene = (point.cTl, point.time_offset_s, twists.T), _scene(pairs, counts)
         known = columns_of_jacobian(J, alignment, scene, base_taus_s, at, assumptions)
+    assert alignment.normals is not None
     by_picture = J[:, 13:14] * alignment.normals
     ends = np.cumsum(counts).tolist()
     found = []
