@@ -79,7 +79,8 @@ class NodeMessages(MessageMaker):
 
 def diagnosis_of(update: TrackUpdate) -> Diagnosis:
     """The calibration's diagnosis: status, sigmas, offset."""
-    words = [update.status, update.reason, update.suspected_change, *update.contradictions]
+    unconfirmed = update.unconfirmed_reason or update.suspected_change
+    words = [update.status, update.reason, unconfirmed, *update.contradictions]
     words.append(update.undecided_sweep)
     words += [weak.sentence for weak in update.weak_directions[:1]]
     sigmas = update.sigmas

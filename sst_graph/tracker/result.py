@@ -16,7 +16,6 @@ from sst_graph.result import CalibrationResult, FrameId, Status
 from sst_graph.tracker.track_update import TrackUpdate, current_update
 
 if TYPE_CHECKING:
-    from sst_graph.tracker.monitor.monitor import Monitor
     from sst_graph.tracker.tracker import Tracker
 
 _NO_ESTIMATE = {
@@ -41,7 +40,7 @@ def tracker_result(tracker: Tracker, drive: str, camera_name: str) -> Calibratio
     elif last.status == "contradicted":
         reasons = (*last.contradictions, *reasons)
     elif last.status == "unconfirmed":
-        reasons = tuple(filter(None, (*_unconfirmed(last, tracker.monitor), window.lacking_labels())))
+        reasons = tuple(filter(None, (last.unconfirmed_reason, window.lacking_labels())))
         status = "not_converged" if reasons else "unobservable"  # for an undecided sweep alone
     elif last.status != "ok":
         reasons = tuple(filter(None, (_NO_ESTIMATE[last.status], tracker.initializer.why)))
@@ -86,26 +85,6 @@ def tracker_result(tracker: Tracker, drive: str, camera_name: str) -> Calibratio
             **({} if config.drift.enabled else {KEY: to_document(estimate.information_log.gained(drive))}),
         },
         versions=package_versions(),
-    )
-
-
-def _unconfirmed(last: TrackUpdate, monitor: Monitor) -> tuple[str, ...]:
-    changes = monitor.changes
-    if changes.start_unconfirmed:
-        return ("no frames that came after the start have been found to agree with those it was made of",)
-    if monitor.contradicted:
-        why = last.suspected_change or "a changed calibration, or wrong labels; further frames show which"
-        return (f"the latest frames contradict the estimate: {why}",)
-    if not changes.confirmation.too_old:
-        return ()
-    of_offset = (
-        f", nor one of the time offset for {last.time_offset_unconfirmed_s:.1f} s of driving"
-        if last.time_offset_unconfirmed_s > 0.0
-        else ""
-    )
-    return (
-        "no frame would have shown a change of where the camera looks for the last "
-        f"{last.unconfirmed_s:.1f} s{of_offset}",
     )
 
 

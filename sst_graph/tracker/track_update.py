@@ -15,6 +15,7 @@ from sst_graph.result import WeakDirection
 from sst_graph.types import ByValue, Calibration, FloatArray
 
 if TYPE_CHECKING:
+    from sst_graph.tracker.monitor.monitor import Monitor
     from sst_graph.tracker.tracker import Tracker
 
 Sensor = Literal["image", "scan"]
@@ -54,6 +55,7 @@ class TrackUpdate(ByValue):
         frame: index of the frame; None where a scan or an image was added alone.
         estimated: value and standard deviation of each parameter that is estimated beside the calibration, by
             its assumption's name, in its unit; empty while there is no estimate.
+        unconfirmed_reason: why no frames confirm the estimate, under whatever status; empty where they do.
         undecided_sweep: that the scans do not show whether they are compensated for the sweep, where it
             matters; else empty.
     """
@@ -80,6 +82,7 @@ class TrackUpdate(ByValue):
     frame: int | None = None
     estimated: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     undecided_sweep: str = ""
+    unconfirmed_reason: str = ""
 
     @property
     def calibration(self) -> Calibration:
@@ -116,6 +119,7 @@ class TrackUpdate(ByValue):
             "alarm": self.alarm,
             "unconfirmed_s": self.unconfirmed_s,
             "time_offset_unconfirmed_s": self.time_offset_unconfirmed_s,
+            "unconfirmed_reason": self.unconfirmed_reason,
             "adopted": self.adopted,
             "converged": self.converged,
             "contradictions": list(self.contradictions),
@@ -145,15 +149,13 @@ def make_update(
     since_scan_s = tracker.inputs.window.seconds_since_scan(stamp_ns) if estimate.exists else 0.0
     status: TrackStatus = "alarm" if tracker.initializer.alarmed else "starting"
     weak: tuple[WeakDirection, ...] = ()
-    sweep = ""
+    sweep = why = ""
     if estimate.exists:
         limits = tracker.setup.config.calibration.observability
         weak = open_directions(covariance, estimate.uncertainty.by_static_objects, point.cTl, limits)
         sweep = estimate.by_sweep().sentence
-        contradicted = tracker.monitor.contradicted
-        too_old = confirmation.too_old_after(since_scan_s)
-        unconfirmed = changes.start_unconfirmed or contradicted or too_old or sweep
-        status = "unobservable" if weak else "unconfirmed" if unconfirmed else "ok"
+        why = _unconfirmed(tracker.monitor, since_scan_s)
+        status = "unobservable" if weak else "unconfirmed" if why or sweep else "ok"
         status = "contradicted" if contradictions else status
     return TrackUpdate(
         stamp_ns=stamp_ns,
@@ -174,6 +176,32 @@ def make_update(
         contradictions=contradictions,
         estimated=estimate.parameters,
         undecided_sweep=sweep,
+        unconfirmed_reason=why,
+    )
+
+
+def _unconfirmed(monitor: Monitor, since_scan_s: float) -> str:
+    """Why no frames confirm the estimate; empty where they do.
+
+    Args:
+        since_scan_s: time since the last scan that could be used.
+    """
+    changes, confirmation = monitor.changes, monitor.changes.confirmation
+    if changes.start_unconfirmed:
+        return "no frames that came after the start have been found to agree with those it was made of"
+    if monitor.contradicted:
+        why = changes.suspected_change or "a changed calibration, or wrong labels; further frames show which"
+        return f"the latest frames contradict the estimate: {why}"
+    if not confirmation.too_old_after(since_scan_s):
+        return ""
+    of_offset = (
+        f", nor one of the time offset for {confirmation.time_offset_s:.1f} s of driving"
+        if confirmation.time_offset_s > 0.0
+        else ""
+    )
+    turn_s = confirmation.turn_s + since_scan_s
+    return (
+        f"no frame would have shown a change of where the camera looks for the last {turn_s:.1f} s{of_offset}"
     )
 
 

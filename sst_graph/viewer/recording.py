@@ -342,7 +342,8 @@ def _turbo(shares: FloatArray) -> NDArray[np.uint8]:
 
 
 def _sentence(update: TrackUpdate) -> str:
-    parts = [update.status, update.reason, update.suspected_change, update.undecided_sweep]
+    unconfirmed = update.unconfirmed_reason or update.suspected_change
+    parts = [update.status, update.reason, unconfirmed, update.undecided_sweep]
     parts += ["alarm: the calibration has changed"] * update.alarm + ["adopted"] * update.adopted
     return "; ".join(part for part in parts if part)
 

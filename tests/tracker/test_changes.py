@@ -272,6 +272,7 @@ def test_no_estimate_is_ok_while_the_latest_frames_contradict_it(
         alone += [frame.index] if newest and past < 2 else []
         if (past > 1 or newest) and not update.alarm:
             assert update.status == "unconfirmed" and not update.adopted
+            assert update.unconfirmed_reason.startswith("the latest frames contradict the estimate")
             before.append(frame.index)
             assert "contradict the estimate" in tracker.result().reasons[0]
     assert before and before[0] >= STEP and alone
@@ -298,6 +299,8 @@ def test_a_knock_that_no_frame_can_show_is_not_ok(
     assert ages[STEP - 1] == 0.0
     np.testing.assert_allclose(np.diff(ages[STEP - 1 :]), 0.1036, atol=2e-3)
     assert update.status == "unconfirmed" and update.to_dict()["unconfirmed_s"] > 1.0
+    assert update.unconfirmed_reason.startswith("no frame would have shown a change")
+    assert f"for the last {update.unconfirmed_s:.1f} s" in update.unconfirmed_reason
     assert tracker.result().status == "not_converged"
     assert "no frame would have shown" in tracker.result().reasons[0]
 

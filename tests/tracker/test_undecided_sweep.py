@@ -24,7 +24,7 @@ OPEN = SweepDecision("undecided", TIMING, 0.1, 0.4, others=BOTH)
 SLOW = replace(streets.SHORT_STREET, speed_mps=1.7)
 """In a narrow view too slow a drive to show whether it is compensated."""
 WIDE = ["observability.time_offset_s=0.1", "observability.translation_m=0.2"]
-"""It determines the time offset to some 10 ms, the translation to some 5 cm, with an open sweep or without."""
+"""It determines the time offset to some 10 ms, the translation to some 5 cm, whatever the sweep."""
 SOON = [*streets.SOON, *(f"calibration.{setting}" for setting in WIDE)]
 OPTIONS = [word for setting in SOON for word in ("--set", setting)]
 
