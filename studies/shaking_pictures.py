@@ -6,8 +6,8 @@ images that jitter.
 Pictures and masks of simulated streets are moved by an amount of their own, normally distributed, half as far
 across as up or down; or the stamps of images are. By labels, with ``calibrate`` and, over the same frames,
 with the tracker: medians of NEES (of 7), and the largest error over its deviation, without the part of the
-covariance by such shifts and with it. Of ``calibrate`` results that are ``ok``; of the tracker all, for in so
-few frames hardly one is confirmed.
+covariance by such shifts and with it. Of ``calibrate`` results that are ``ok``; of the tracker all that have
+an estimate, for in so few frames hardly one is confirmed.
 """
 
 from __future__ import annotations
@@ -96,16 +96,17 @@ def outcome_of(drive: KeptDrive, start: gtsam.Pose3) -> Outcome:
     return Outcome.of(result.status, error_of(result.calibration, truth), shifts, result.covariance)
 
 
-def tracked(drive: KeptDrive, start: gtsam.Pose3) -> Outcome:
-    """Of one drive by the tracker, against its truth."""
+def tracked(drive: KeptDrive, start: gtsam.Pose3) -> Outcome | None:
+    """Of one drive by the tracker, against its truth; None where it finds no start."""
     assert drive.truth is not None
     drive = with_sweep(drive, True)
     tracker = Tracker(drive.camera, TrackerConfig(), start, sweep=drive.sweep_decision)
     for frame in drive:
         tracker.add(frame)
     last = tracker.optimize()
+    if last.covariance is None:
+        return None
     error, shifts = error_of(last.calibration, drive.truth), tracker.estimate.uncertainty.shifts
-    assert last.covariance is not None
     return Outcome.of(last.status, error, shifts, last.covariance)
 
 
@@ -125,7 +126,7 @@ def main() -> None:
             assert source.truth is not None
             start = source.truth.cTl.retract(start_step(name))
             by_all.append(outcome_of(drive, start))
-            by_tracker.append(tracked(drive, start))
+            by_tracker += filter(None, [tracked(drive, start)])
         print(_row(pixels, milliseconds, "calibrate", by_all, [one for one in by_all if one.status == "ok"]))
         print(_row(pixels, milliseconds, "tracker", by_tracker, by_tracker), flush=True)
 
