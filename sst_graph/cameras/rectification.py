@@ -27,6 +27,8 @@ _LEAST_SIDE_PX = 16
 _STRETCH_STEP_PX = 32
 """Of the grid on which the enlargement is known [px]; from one place to the next it changes by some per
 cent."""
+_GRID = 64
+"""Columns and rows of the grid by which the part of the raw image that is used is counted."""
 _LEAST_SHRINKING = 1e-3
 """Least area in the raw image of a pixel of the pinhole [px^2]: below it the lens's field ends."""
 
@@ -103,6 +105,17 @@ class Rectification:
         # All four neighbours of a bilinear look-up are on the image.
         inside = ((uvs >= 0.0) & (uvs <= [model.width - 1, model.height - 1])).all(axis=1)
         return uvs.reshape(*u.shape, 2), np.asarray(inside).reshape(u.shape)
+
+    @cached_property
+    def used_share(self) -> float:
+        """Share of the raw image that the pinhole shows, by a grid over it."""
+        sides = self.model.width, self.model.height
+        grid = np.meshgrid(*(np.linspace(0.0, side - 1.0, min(side, _GRID)) for side in sides))
+        rays, valid = self.model.unproject(np.column_stack([axis.ravel() for axis in grid]))
+        uvs = self.camera.project(np.where(valid[:, None], rays, [0.0, 0.0, -1.0]))
+        # Half a pixel around it: the pinhole begins and ends with the centres of the raw image's pixels.
+        seen = (uvs >= -0.5) & (uvs <= [self.camera.width - 0.5, self.camera.height - 0.5])
+        return float(np.mean(seen.all(axis=1)))
 
     @property
     def valid(self) -> BoolArray:

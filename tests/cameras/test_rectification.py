@@ -108,6 +108,15 @@ def test_a_pinhole_stays_what_it_is() -> None:
     np.testing.assert_array_equal(Rectification.of(model).picture(picture), picture)
 
 
+def test_the_share_of_the_raw_image_that_is_used() -> None:
+    """All of a lens that bends little; of a narrower field that much; little of a lens that is not one."""
+    K = PinholeCamera(500.0, 500.0, 319.5, 99.5, 640, 200)
+    assert Rectification(BrownConradyCamera(K), K).used_share == 1.0
+    half = PinholeCamera(500.0, 500.0, 159.5, 99.5, 320, 200)
+    assert Rectification(BrownConradyCamera(K), half).used_share == pytest.approx(0.5, abs=0.02)
+    assert Rectification.of(BrownConradyCamera(K, (-5.0, 0.0, 0.0, 0.0))).used_share < 0.3
+
+
 def test_fields_that_no_pinhole_has() -> None:
     for wrong in (0.0, 190.0, np.nan):
         with pytest.raises(ConfigError, match="wider fields need several pinholes"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import shutil
 from dataclasses import asdict
 from pathlib import Path
@@ -99,10 +100,12 @@ def test_a_folder_of_a_lens_that_distorts_is_rectified(tmp_path: Path) -> None:
         "model": "plumb_bob",
         **asdict(plain.camera),
         "distortion": {"coefficients": (-0.1, 0.0, 0.0, 0.0)},
+        "used_share": round(rectification.used_share, 3),
     }
     assert info.camera["lens"] == lens and info.image_sensor == drive_info(plain).image_sensor
     lines = info_text(info).splitlines()
     assert lines[2].strip().startswith("rectified from plumb_bob") and lines[2].endswith("-0.1 0 0 0")
+    assert re.fullmatch(r" +uses about 9\d % of its pictures", lines[3])
     assert "lens" not in drive_info(plain).camera
 
 

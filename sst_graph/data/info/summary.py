@@ -106,7 +106,7 @@ class DriveInfo:
         name: of the drive.
         frames: number of frames.
         camera: model, intrinsics [px] and size [px]; of pictures that are rectified as they are read also the
-            ``lens``, with its own.
+            ``lens``, with its own and the share of its pictures that is used.
         scan_sensor, image_sensor: numbers, rates, stamps.
         scans, images: what those looked at hold; None where there was none.
         nominal: whether the data bring a nominal extrinsic; ``nominal_reason``: where from, or why not.
@@ -175,7 +175,9 @@ def _camera(source: Source) -> dict[str, Any]:
     rectification = getattr(source, "rectification", None)
     if isinstance(rectification, Rectification):
         lens = asdict(rectification.model)
-        table["lens"] = {"model": rectification.model.name, **lens.pop("intrinsics"), "distortion": lens}
+        model, intrinsics = rectification.model.name, lens.pop("intrinsics")
+        used = round(rectification.used_share, 3)
+        table["lens"] = {"model": model, **intrinsics, "distortion": lens, "used_share": used}
     return table
 
 

@@ -28,6 +28,7 @@ def _lines(info: DriveInfo) -> Iterator[tuple[str, str]]:
     if "lens" in info.camera:
         lens = info.camera["lens"]
         yield "", f"rectified from {_camera(lens)}, {_distortion(lens['distortion'])}"
+        yield "", f"uses about {round(100 * lens['used_share'])} % of its pictures"
     for name, sensor in (("images", info.image_sensor), ("scans", info.scan_sensor)):
         yield name, _sensor(sensor)
         for gap in sorted(sensor.gaps, key=lambda one: -one.seconds)[:_GAPS]:
