@@ -106,7 +106,7 @@ class Rectification:
         inside = ((uvs >= 0.0) & (uvs <= [model.width - 1, model.height - 1])).all(axis=1)
         return uvs.reshape(*u.shape, 2), np.asarray(inside).reshape(u.shape)
 
-    @cached_property
+    @property
     def used_share(self) -> float:
         """Share of the raw image that the pinhole shows, by a grid over it."""
         sides = self.model.width, self.model.height

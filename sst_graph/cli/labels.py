@@ -63,35 +63,31 @@ def check_classes(sources: Sequence[Source], classes: Sequence[SemanticClass], a
                 )
 
 
-def require_labels(sources: Sequence[Source], method: str) -> None:
-    """Require labels on each side for a method that aligns nothing else; those by networks are made later.
+def require_labels(cameras: Sequence[Sequence[Source]], method: str) -> None:
+    """Require labels on each side of one camera at least, for a method that aligns nothing else; those by
+    networks are made later.
+
+    Args:
+        cameras: drives of each.
 
     Raises:
-        DataError: no scan of any drive has labels, or no image; or a frame that cannot be read.
+        DataError: no scan of any drive has labels, or no image, for every camera; or a frame that cannot be
+            read.
     """
-    _refuse(sources, method, _missing(sources, method))
-
-
-def require_labels_of_a_camera(cameras: Sequence[Sequence[Source]], method: str) -> None:
-    """The same of one camera of a rig at least.
-
-    Raises:
-        DataError: no camera has what the method needs; or a frame that cannot be read.
-    """
-    missing: list[str] = []
-    for own in cameras:
-        missing = _missing(own, method)
-        if not missing:
+    found = []
+    for sources in cameras:
+        found.append(_missing(sources, method))
+        if not found[-1]:
             return
-    _refuse(cameras[0], method, missing)
+    raise DataError(
+        ", ".join(source.name for source in cameras[0]),
+        f"no {' and no '.join(found[0])}",
+        f"both for method {method}: say where they are, make them by networks, or take --method edges",
+    )
 
 
 def _missing(sources: Sequence[Source], method: str) -> list[str]:
-    """What labels a method needs and no drive has.
-
-    Raises:
-        DataError: a frame that cannot be read.
-    """
+    """What labels a method needs and no drive has."""
     if method not in METHODS_BY_LABELS or any(getattr(one, "labelling", None) is not None for one in sources):
         return []
     missing = []
@@ -100,15 +96,6 @@ def _missing(sources: Sequence[Source], method: str) -> list[str]:
     if not any(_any_labels(image_positions(one), partial(image_at, one)) for one in sources):
         missing.append("semantic masks of images")
     return missing
-
-
-def _refuse(sources: Sequence[Source], method: str, missing: Sequence[str]) -> None:
-    if missing:
-        raise DataError(
-            ", ".join(source.name for source in sources),
-            f"no {' and no '.join(missing)}",
-            f"both for method {method}: say where they are, make them by networks, or take --method edges",
-        )
 
 
 def _any_labels(positions: Sequence[int], read: Callable[[int], Scan | CameraImage | None]) -> bool:

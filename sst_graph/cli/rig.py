@@ -13,10 +13,10 @@ import gtsam
 import numpy as np
 
 from sst_graph.batch import CalibrationConfig
-from sst_graph.batch.by_edges.choice import cameras_without_labels
+from sst_graph.batch.by_edges.choice import choice_for_cameras
 from sst_graph.cli import EXIT_NOT_TRUSTED
 from sst_graph.cli.inputs import calibration_settings, open_drives, starting_point
-from sst_graph.cli.labels import check_classes, require_labels_of_a_camera
+from sst_graph.cli.labels import check_classes, require_labels
 from sst_graph.cli.messages import complain, mention, say
 from sst_graph.cli.output_places import check_apart
 from sst_graph.cli.outputs import CALIBRATION, comparison, result_numbers, why_not_ok, write_calibration
@@ -134,8 +134,8 @@ def _calibrated(
     """The drives of each camera, and their calibration, with progress on stderr."""
     of_camera = {name: argparse.Namespace(**{**vars(args), "camera": name}) for name in cameras}
     sources, read_as = _opened(of_camera)
-    require_labels_of_a_camera(list(sources.values()), config.method)
-    _warn_of_cameras_without_labels(sources, config)
+    require_labels(list(sources.values()), config.method)
+    config = _with_method(config, sources)
     check_classes(next(iter(sources.values())), config.classes, args.classes)
     initial, offsets_s = _starts(args.init, sources, read_as)
     known = KnownRig(_known_poses(args.rig, sources, *sigmas), one_trigger=args.one_trigger)
@@ -182,16 +182,17 @@ def _opened(
     return sources, read_as
 
 
-def _warn_of_cameras_without_labels(
-    sources: Mapping[str, Sequence[Source]], config: CalibrationConfig
-) -> None:
-    """Say which cameras are why method auto leaves out the labels of the others."""
-    without = cameras_without_labels(sources) if config.method == "auto" else ()
+def _with_method(config: CalibrationConfig, sources: Mapping[str, Sequence[Source]]) -> CalibrationConfig:
+    """The settings with the method that the sources allow; it is said which cameras are why method auto
+    leaves out the labels of the others."""
+    config, without = choice_for_cameras(config, list(sources.values()))
     if without and len(without) < len(sources):
+        names = [name for k, name in enumerate(sources) if k in without]
         complain(
-            f"warning: {', '.join(without)}: found no labels, so all cameras are calibrated without them: "
-            "label these images, or use the labels of the others by --method joint"
+            f"warning: {', '.join(names)}: found no labels, so all cameras are calibrated "
+            "without them: label these images, or use the labels of the others by --method joint"
         )
+    return config
 
 
 def _starts(

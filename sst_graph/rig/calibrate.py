@@ -24,11 +24,7 @@ from sst_graph.batch.method_estimate import UNKNOWN_SIGMAS, MethodEstimate, qual
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.batch.sources import as_sources
 from sst_graph.config import expect_settings, to_dict
-from sst_graph.covariance.observability import (
-    involves_offset,
-    open_directions,
-    reasons_of,
-)
+from sst_graph.covariance.observability import involves_offset, open_directions, reasons_of
 from sst_graph.covariance.shared_errors import SharedErrors
 from sst_graph.drive.further_camera import with_camera
 from sst_graph.drive.preparation import Drive, Progress, check_progress
@@ -372,8 +368,10 @@ class _Rig:
             for name in self.cameras
         }
         static = self._static_covariances()
+        weak = {name: self._weak(name, after, static[name], config) for name in self.cameras}
         results = {
-            name: self._camera_result(name, after, static[name], wrong[name], config) for name in self.cameras
+            name: _camera_result(camera, name, after, weak[name], wrong[name])
+            for name, camera in self.cameras.items()
         }
         return RigResult(
             results,
@@ -384,20 +382,19 @@ class _Rig:
             self._diagnostics(),
         )
 
-    def _camera_result(
-        self,
-        name: str,
-        after: RigMarginal,
-        static: FloatArray,
-        wrong: Sequence[str],
-        config: CalibrationConfig,
-    ) -> CalibrationResult:
-        """A camera's result after the adjustment, with the sentences that make it wrong."""
+    def _weak(
+        self, name: str, after: RigMarginal, static: FloatArray, config: CalibrationConfig
+    ) -> tuple[WeakDirection, ...]:
+        """Directions of a camera that are known worse than the limits, after the adjustment.
+
+        Args:
+            static: (7, 7) covariance by static objects alone.
+        """
         covariance, cTl = after.of_camera(name), after.extrinsics[after.names.index(name)]
         weak = open_directions(covariance, static, cTl, config.observability)
         if self._set_aside(name) or self.cameras[name].estimate is None:
             weak = _with_advice(weak, self.agreed, name)
-        return _camera_result(self.cameras[name], name, after, weak, wrong)
+        return weak
 
     def _static_covariances(self) -> dict[str, FloatArray]:
         """(7, 7) of each camera by static objects alone, and what is known of the rig."""

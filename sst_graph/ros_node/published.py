@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sst_graph.data.ros.messages import MessageMaker
-from sst_graph.tracker.track_update import TrackUpdate
+from sst_graph.tracker.track_update import TrackUpdate, unconfirmed_sentences
 
 DIAGNOSTICS, STRING = "diagnostic_msgs/msg/DiagnosticArray", "std_msgs/msg/String"
 OK, WARN, ERROR, STALE = range(4)
@@ -79,8 +79,7 @@ class NodeMessages(MessageMaker):
 
 def diagnosis_of(update: TrackUpdate) -> Diagnosis:
     """The calibration's diagnosis: status, sigmas, offset."""
-    unconfirmed = update.unconfirmed_reason or update.suspected_change
-    words = [update.status, update.reason, unconfirmed, *update.contradictions]
+    words = [update.status, update.reason, *unconfirmed_sentences(update), *update.contradictions]
     words.append(update.undecided_sweep)
     words += [weak.sentence for weak in update.weak_directions[:1]]
     sigmas = update.sigmas

@@ -107,8 +107,7 @@ def image_model(path: Path, table: Mapping[str, Any]) -> ImageModel:
     Raises:
         DataError: an unknown key, or a value out of its range.
     """
-    _refuse_kind(table, _IMAGE_KEYS, _SCAN_KEYS, path, "scans (--lidar-model)")
-    _refuse_others(table, _IMAGE_KEYS, path)
+    _refuse_others(table, _IMAGE_KEYS, path, _SCAN_KEYS, "scans (--lidar-model)")
     default = PictureInput()
     values = PictureInput(
         width=_size(table, "width", path),
@@ -140,8 +139,7 @@ def scan_model(path: Path, table: Mapping[str, Any]) -> ScanModel:
     Raises:
         DataError: an unknown key, or a value out of its range.
     """
-    _refuse_kind(table, _SCAN_KEYS, _IMAGE_KEYS, path, "pictures (--image-model)")
-    _refuse_others(table, _SCAN_KEYS, path)
+    _refuse_others(table, _SCAN_KEYS, path, _IMAGE_KEYS, "pictures (--image-model)")
     default = RangeView()
     view = RangeView(
         width=_size(table, "width", path) or default.width,
@@ -235,20 +233,23 @@ def _described(path: Path, expected: str) -> Path:
     return path
 
 
-def _refuse_kind(
-    table: Mapping[str, Any], keys: tuple[str, ...], of_others: tuple[str, ...], path: Path, others: str
+def _refuse_others(
+    table: Mapping[str, Any],
+    keys: tuple[str, ...],
+    place: str | Path,
+    of_others: tuple[str, ...] = (),
+    others: str = "",
 ) -> None:
-    """Refuse the file of a network for the other sensor: it has keys that only these have."""
-    for key in table:
-        if key in of_others and key not in keys:
-            expected = f"some of {', '.join(keys)}; a network for {others} has that key"
-            raise DataError(path, f"the key {key!r:.40}", expected)
+    """Refuse keys that are none of these; of_others: keys of the networks that ``others`` names.
 
-
-def _refuse_others(table: Mapping[str, Any], keys: tuple[str, ...], place: str | Path) -> None:
-    for key in table:
-        if key not in keys:
-            raise DataError(place, f"the key {key!r:.40}", f"some of {', '.join(keys)}")
+    Those come first: they tell more.
+    """
+    unknown = sorted((key for key in table if key not in keys), key=lambda key: key not in of_others)
+    if unknown:
+        key, expected = unknown[0], f"some of {', '.join(keys)}"
+        if key in of_others:
+            expected += f"; a network for {others} has that key"
+        raise DataError(place, f"the key {key!r:.40}", expected)
 
 
 def _numbers(table: Mapping[str, Any], path: Path) -> LabelNumbers:

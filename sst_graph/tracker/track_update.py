@@ -131,6 +131,12 @@ class TrackUpdate(ByValue):
         }
 
 
+def unconfirmed_sentences(update: TrackUpdate) -> tuple[str, ...]:
+    """Why no frames confirm the estimate, and a suspected change where that does not say it."""
+    why, change = update.unconfirmed_reason, update.suspected_change
+    return tuple(filter(None, (why, "" if change in why else change)))
+
+
 def make_update(
     tracker: Tracker, stamp_ns: int, reason: str = "", *, chi2: float | None = None, alarm: bool = False
 ) -> TrackUpdate:

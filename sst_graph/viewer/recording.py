@@ -22,7 +22,7 @@ from sst_graph.errors import ConfigError, optional_module
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.inspect.inspection import HUMAN
 from sst_graph.sampling import step_for
-from sst_graph.tracker.track_update import TrackUpdate
+from sst_graph.tracker.track_update import TrackUpdate, unconfirmed_sentences
 from sst_graph.types import Calibration, FloatArray, SemanticClass
 from sst_graph.viewer.frame_view import FrameView, MatchView
 from sst_graph.viewer.recorded_file import RecordedFile
@@ -342,8 +342,7 @@ def _turbo(shares: FloatArray) -> NDArray[np.uint8]:
 
 
 def _sentence(update: TrackUpdate) -> str:
-    unconfirmed = update.unconfirmed_reason or update.suspected_change
-    parts = [update.status, update.reason, unconfirmed, update.undecided_sweep]
+    parts = [update.status, update.reason, *unconfirmed_sentences(update), update.undecided_sweep]
     parts += ["alarm: the calibration has changed"] * update.alarm + ["adopted"] * update.adopted
     return "; ".join(part for part in parts if part)
 

@@ -26,7 +26,7 @@ from sst_graph.simulator import SimulatedDrive
 from sst_graph.tracker.config import AlarmConfig, DriftConfig, TrackerConfig
 from sst_graph.tracker.history import HistoryEntry
 from sst_graph.tracker.monitor.confirmation import DETECTABLE_OFFSET_S, DETECTABLE_TURN_RAD, steps
-from sst_graph.tracker.track_update import TrackUpdate, current_update
+from sst_graph.tracker.track_update import TrackUpdate, current_update, unconfirmed_sentences
 from sst_graph.types import Frame, SemanticClass
 
 STEP = 20
@@ -459,3 +459,15 @@ def test_a_scan_without_match_is_not_compared_again_when_its_turn_comes(
     assert old not in known
     assert changes.check([old], {old: 100}, compared) is None
     assert list(changes.scans) == known and changes.statistic.latest is latest
+
+
+def test_a_suspected_change_is_said_once_beside_why_nothing_confirms_the_estimate() -> None:
+    def said(reason: str, change: str) -> tuple[str, ...]:
+        update = TrackUpdate(0, gtsam.Pose3(), 0.0, None, "unconfirmed", True)
+        return unconfirmed_sentences(
+            dataclasses.replace(update, unconfirmed_reason=reason, suspected_change=change)
+        )
+
+    assert said("", "") == () and said("too old", "") == ("too old",) and said("", "one car") == ("one car",)
+    assert said("contradicted: one car", "one car") == ("contradicted: one car",)
+    assert said("too old", "one car") == ("too old", "one car")

@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sst_graph.covariance.error_model import ErrorModel, SideResiduals, fit_error_model
+from sst_graph.covariance.image_shifts import NO_MOMENTS
 from sst_graph.covariance.level_edges import LevelEdges
 from sst_graph.covariance.sums import ScoreSums
 from sst_graph.tracker.config import AlarmConfig, TrackerConfig
@@ -105,8 +106,8 @@ def _score(rng: np.random.Generator, truth: FloatArray, side: int) -> Linearized
     point = Point(gtsam.Pose3(), 0.0, np.zeros(2))
     information = Gaussian(point, J.T @ J, -J.T @ r)
     scores = ScoreSums.of_frame(J, ones, side + which, LevelEdges.none(200))
-    nothing = np.zeros((N, 3))
-    return LinearizedPair(information, information, scores, residuals, 200, by_shifts=nothing)
+    shifts = {"shifts": NO_MOMENTS, "by_shifts": np.zeros((N, 3))}
+    return LinearizedPair(information, information, scores, residuals, 200, **shifts)
 
 
 def _model() -> ErrorModel:

@@ -70,17 +70,23 @@ def _columns(robust: RobustCovariance, point: Point) -> NDArray[np.intp]:
     return np.array([column for key in robust.unknowns.keys for column in found[key]])
 
 
+def _parted(
+    point: Point, linear: list[LinearizedPair], left: int
+) -> tuple[RunningSums, list[LinearizedPair], list[NDArray[np.intp]]]:
+    """Sums of the frames that have left, those of the window, and the columns of these."""
+    sums, columns = RunningSums.empty(point.size), [point.columns(p.information.point.tracks) for p in linear]
+    for scan in range(left):
+        sums.add(linear[scan], columns[scan], scan)
+    return sums, linear[left:], columns[left:]
+
+
 @pytest.mark.parametrize("left", [0, 3, 6])
 def test_the_sums_are_the_batch_s(
     matched: tuple[RobustCovariance, list[PairMatches], Point, list[LinearizedPair]], left: int
 ) -> None:
     """Wherever the frames are: in the window, or gone from it."""
     robust, _, point, linear = matched
-    columns, sums = _columns(robust, point), RunningSums.empty(point.size)
-    of_pairs = [point.columns(pair.information.point.tracks) for pair in linear]
-    for scan in range(left):
-        sums.add(linear[scan], of_pairs[scan], scan)
-    window, own = linear[left:], of_pairs[left:]
+    columns, (sums, window, own) = _columns(robust, point), _parted(point, linear, left)
     model = sums.error_model(window)
     np.testing.assert_allclose(
         [model.side, model.side_frame, model.match],
@@ -117,11 +123,8 @@ def test_shifts_from_image_to_image_are_the_batch_s(
     matched: tuple[RobustCovariance, list[PairMatches], Point, list[LinearizedPair]], left: int
 ) -> None:
     robust, pairs, point, linear = matched
-    columns, sums = _columns(robust, point), RunningSums.empty(point.size)
-    of_pairs = [point.columns(pair.information.point.tracks) for pair in linear]
-    for scan in range(left):
-        sums.add(linear[scan], of_pairs[scan], scan)
-    variances, excess = sums.shift_excess(linear[left:], of_pairs[left:])
+    columns, (sums, window, own) = _columns(robust, point), _parted(point, linear, left)
+    variances, excess = sums.shift_excess(window, own)
     state = State(point.cTl, (OFFSET_S,))
     values = joint_graph(pairs, state, CONFIG)[1]
     by_image = columns_by_image(robust.table, pairs, values, state)

@@ -3,7 +3,7 @@ have labels."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -48,31 +48,27 @@ def with_method_for_cameras(
     Raises:
         DataError: a frame cannot be read.
     """
-    if config.method != "auto":
-        return config
-    first = cameras[0] if cameras else ()
-    sampled = [
-        _SampledFrames(source, scans_of)
-        for own in cameras
-        for source, scans_of in zip(own, first, strict=False)
-    ]
-    method = _method(sampled, config)
-    return replace(config, method="edges" if method == "both" else method)
+    return choice_for_cameras(config, cameras)[0]
 
 
-def cameras_without_labels(cameras: Mapping[str, Sequence[Source]]) -> tuple[str, ...]:
-    """The cameras on a LiDAR for which method auto takes edges in the place of labels, by name: a drive of
-    theirs has pictures and no labels.
+def choice_for_cameras(
+    config: CalibrationConfig, cameras: Sequence[Sequence[Source]]
+) -> tuple[CalibrationConfig, list[int]]:
+    """The same, and the positions of the cameras for which method auto takes edges in the place of labels: a
+    drive of theirs has pictures and no labels.
 
     Raises:
         DataError: a frame cannot be read.
     """
-    first = next(iter(cameras.values()), ())
-    sampled = {
-        name: [_SampledFrames(source, scans) for source, scans in zip(own, first, strict=False)]
-        for name, own in cameras.items()
-    }
-    return tuple(name for name, each in sampled.items() if _without_labels(each))
+    if config.method != "auto":
+        return config, []
+    first = cameras[0] if cameras else ()
+    sampled = [
+        [_SampledFrames(source, scans) for source, scans in zip(own, first, strict=False)] for own in cameras
+    ]
+    method = _method([each for own in sampled for each in own], config)
+    chosen = replace(config, method="edges" if method == "both" else method)
+    return chosen, [k for k, own in enumerate(sampled) if _without_labels(own)]
 
 
 def with_method_of(config: CalibrationConfig, drives: Sequence[Drive]) -> CalibrationConfig:

@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
             read_as = options_of(args)
             sources = open_drives(args)
             config = dataclasses.replace(with_method_for(config, sources), for_report=not args.no_report)
-            require_labels(sources, config.method)
+            require_labels([sources], config.method)
             if config.method not in ("motion", "edges"):
                 check_classes(sources, config.classes, args.classes)
             elif args.classes is not None:

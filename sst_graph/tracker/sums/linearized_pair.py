@@ -10,7 +10,7 @@ import numpy as np
 
 from sst_graph.association.edge_matching import SIDES
 from sst_graph.covariance.error_model import SideResiduals
-from sst_graph.covariance.image_shifts import NO_MOMENTS, shift_moments
+from sst_graph.covariance.image_shifts import shift_moments
 from sst_graph.covariance.level_edges import LevelEdges
 from sst_graph.covariance.match_table import curvatures_of, unweighted
 from sst_graph.covariance.static_objects import dynamic_matches
@@ -61,8 +61,8 @@ class LinearizedPair:
     weight: float = 1.0
     curvature: float = 1.0
     static: Gaussian | None = None
-    shifts: FloatArray = field(default_factory=NO_MOMENTS.copy)
-    by_shifts: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    shifts: FloatArray = field(kw_only=True)
+    by_shifts: FloatArray = field(kw_only=True)
 
     @property
     def by_static_objects(self) -> Gaussian:
@@ -140,8 +140,8 @@ def _linearized(
         weight,
         curvature,
         _by_static_objects(pair, point, A[:, known], motion[np.ix_(known, known)]),
-        shift_moments(of_shifts / np.sqrt(share), r / np.sqrt(share), side),
-        J.T @ of_shifts,
+        shifts=shift_moments(of_shifts / np.sqrt(share), r / np.sqrt(share), side),
+        by_shifts=J.T @ of_shifts,
     )
 
 

@@ -123,16 +123,24 @@ class RunningSums:
         every = total(n, [self.scores, *(pair.scores for pair in window)], [np.arange(n), *columns])
         return (every if with_held else every.columns(slice(self.size))).excess(model)
 
+    def shift_variances(self, window: Sequence[LinearizedPair]) -> FloatArray:
+        """(3,) variances of the shifts of pictures [px^2, px^2] and of their stamps [s^2] over the images.
+
+        Args:
+            window: pairs beside those added.
+        """
+        return shift_variances(sum((pair.shifts for pair in window), self.shifts))
+
     def shift_excess(
         self, window: Sequence[LinearizedPair], columns: Sequence[IntArray]
     ) -> tuple[FloatArray, FloatArray]:
-        """(3,) variances of the shifts of pictures [px^2, px^2] and of their stamps [s^2], and (3, n, n) what
-        each adds to the variance of the score, over the held parameters, too.
+        """:meth:`shift_variances`, and (3, n, n) what each adds to the variance of the score, over the held
+        parameters, too.
 
         Args:
             window, columns: as of :meth:`excess`.
         """
-        variances = shift_variances(sum((pair.shifts for pair in window), self.shifts))
+        variances = self.shift_variances(window)
         squares = self.by_shifts + _squares(window, columns, self.size + self.held)
         return variances, variances[:, None, None] * squares
 

@@ -365,9 +365,13 @@ class WindowSmoother:
         """
         return self.sums.excess(*self._window_columns(), self.model, with_held)
 
+    def shift_variances(self) -> FloatArray:
+        """(3,) :meth:`RunningSums.shift_variances` over past and window."""
+        return self.sums.shift_variances([entry.linear for entry in self.entries.values()])
+
     def shift_excess(self) -> tuple[FloatArray, FloatArray]:
-        """(3,) variances of the shifts of pictures and of their stamps, and (3, n, n) what each adds to the
-        variance of the score (:meth:`RunningSums.shift_excess`)."""
+        """The same, and (3, n, n) what each adds to the variance of the score
+        (:meth:`RunningSums.shift_excess`)."""
         return self.sums.shift_excess(*self._window_columns())
 
     def _window_columns(self) -> tuple[list[LinearizedPair], list[IntArray]]:
@@ -389,7 +393,7 @@ class WindowSmoother:
 
     def live_epochs(self) -> list[RetiredEpoch]:
         """Epochs of the window, as if they retired now."""
-        found, (shift_variances, _) = [], self.shift_excess()
+        found, shift_variances = [], self.shift_variances()
         for i, epoch in enumerate(self.epochs):
             sums = self.epoch_sums.copy() if i == 0 else EpochSums.empty(self.past.point)
             for scan, entry in self.entries.items():
