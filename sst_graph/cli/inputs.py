@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import gtsam
 
+from sst_graph.cli.labels import ALIGNABLE
 from sst_graph.cli.messages import complain
 from sst_graph.cli.reading import open_drive
 from sst_graph.config import read_config, with_overrides
@@ -19,7 +20,7 @@ from sst_graph.errors import ConfigError, DataError
 from sst_graph.imports import ImportOptions, import_calibration
 from sst_graph.result import CalibrationResult, read_result
 from sst_graph.timestamps import NS_PER_S, apart_s
-from sst_graph.types import SemanticClass, Source
+from sst_graph.types import Source
 
 if TYPE_CHECKING:
     from sst_graph.batch import CalibrationConfig
@@ -157,8 +158,7 @@ def chosen_classes(text: str | None) -> list[str] | None:
     """
     if text is None:
         return None
-    not_alignable = (SemanticClass.OTHER, SemanticClass.IGNORE, SemanticClass.OBJECT)
-    alignable = [label.name.lower() for label in SemanticClass if label not in not_alignable]
+    alignable = [label.name.lower() for label in ALIGNABLE]
     if text == "all":
         return alignable
     names = [name.strip().lower() for name in text.split(",") if name.strip()]

@@ -7,6 +7,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sst_graph.cli.messages import complain
 from sst_graph.data.frame_parts import image_at, image_positions, scan_at, scan_positions
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.sampling import evenly_spread
@@ -19,6 +20,18 @@ LABEL_OPTIONS = ("image_model", "lidar_model", "labels")
 """Options that say what labels a drive."""
 METHODS_BY_LABELS = ("joint", "paper", "static", "semalign")
 """Methods that align nothing without labels of both sensors."""
+ALIGNABLE = tuple(
+    label
+    for label in SemanticClass
+    if label not in (SemanticClass.OTHER, SemanticClass.IGNORE, SemanticClass.OBJECT)
+)
+"""Classes that ``--classes`` takes."""
+_OF_OBJECTS = tuple(
+    label
+    for label in ALIGNABLE
+    if label not in (SemanticClass.GROUND, SemanticClass.TERRAIN, SemanticClass.SKY)
+)
+"""Those that stand before something else, and so have edges in a scan."""
 _FIRST = 8
 """Scans, or images, that are looked at before all others."""
 
@@ -61,6 +74,25 @@ def check_classes(sources: Sequence[Source], classes: Sequence[SemanticClass], a
                     f"{model.name}: found no {missing[0]} among its classes ({known}), expected all that are "
                     "to be aligned (--classes)"
                 )
+
+
+def expect_alignable(segmenters: Sequence[ImageSegmenter | ScanSegmenter | None]) -> None:
+    """Require networks whose labels are of use, before a drive is labelled by them; what ``calibrate`` will
+    have to be told is said.
+
+    Raises:
+        ConfigError: a network that knows no class that can be aligned.
+    """
+    for segmenter in segmenters:
+        if segmenter is None or SemanticClass.VEHICLE in segmenter.known:
+            continue
+        known = [one.name.lower() for one in _OF_OBJECTS if one in segmenter.known]
+        if not known:
+            raise ConfigError(
+                f"{segmenter.name}: found no class that can be aligned among its classes, "
+                f"expected one of {', '.join(one.name.lower() for one in _OF_OBJECTS)}"
+            )
+        complain(f"note: {segmenter.name}: knows no vehicles: calibrate with --classes {','.join(known)}")
 
 
 def require_labels(cameras: Sequence[Sequence[Source]], method: str) -> None:

@@ -339,6 +339,27 @@ def test_the_command_line_ends_with_2_and_one_line(
         assert not (tmp_path / "out").exists()
 
 
+def test_labels_of_no_use_are_refused_before_they_are_made(
+    kitti_drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = write_colour_network(tmp_path / "n.onnx")
+    out = tmp_path / "out"
+    command = ["segment", str(kitti_drive), "--image-model", str(model.with_suffix(".yaml"))]
+    described(f"network: n.onnx\nclasses: {{0: other, 1: ground, 2: sky}}\n{PLAIN}")(tmp_path)
+    assert main([*command, "--out", str(out)]) == 2
+    assert "found no class that can be aligned among its classes" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_labels_without_vehicles_say_what_calibrate_has_to_be_told(
+    kitti_drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_colour_network(tmp_path / "n.onnx")
+    model = described(f"network: n.onnx\nclasses: {{0: pole, 1: ground, 2: fence}}\n{PLAIN}")(tmp_path)
+    assert main(["segment", str(kitti_drive), "--image-model", str(model), "--out", str(tmp_path / "out")]) == 0
+    assert "knows no vehicles: calibrate with --classes pole,fence" in capsys.readouterr().err
+
+
 def test_the_library_starts_without_the_extras(monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither importing the package nor reading its help imports what a network runs by."""
     found: list[str] = []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from sst_graph.cli.labels import image_segmenter, scan_segmenter, store_to_fill
+from sst_graph.cli.labels import expect_alignable, image_segmenter, scan_segmenter, store_to_fill
 from sst_graph.cli.messages import mention
 from sst_graph.cli.output_places import check_apart
 from sst_graph.cli.progress import ProgressBar
@@ -23,6 +23,7 @@ def run(args: argparse.Namespace) -> int:
     )
     store = store_to_fill(args.out)
     images, scans = image_segmenter(args.image_model), scan_segmenter(args.lidar_model)
+    expect_alignable((images, scans))
     args.image_model = args.lidar_model = None  # of the drive as the data have it
     source = open_drive(args, args.data)
     drive = LabelledSource(source, Labelling.of(store, images, scans, stored=False))
