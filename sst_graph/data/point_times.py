@@ -17,16 +17,22 @@ _OF_WHOLE_NS = (1, 1_000, 1_000_000)
 """Units in which times are counted, the usual one first."""
 
 
+def tells_nothing(values: NDArray[Any]) -> bool:
+    """Whether times (n,) of points are all the same: drivers leave the field at 0, or write the scan's own
+    time.
+    """
+    return not values.any() or (len(values) > 1 and bool((values == values[0]).all()))
+
+
 def seconds_after_stamp(values: NDArray[Any], stamp_ns: int) -> NDArray[np.float64] | None:
-    """Times (n,) of points after their scan's stamp [s]; None where all are the same, which tells nothing:
-    drivers leave the field at 0, or write the scan's own time.
+    """Times (n,) of points after their scan's stamp [s]; None where they tell nothing.
 
     Drivers count seconds in floats and nanoseconds in whole numbers, and some milliseconds or microseconds,
     after the stamp or on the stamp's clock. The unit is that by which the scan lasts 5 ms to 0.5 s within
     FARTHEST_S of its stamp. Where none fits, it is the usual one, or absolute nanoseconds in floats (Livox),
     whichever leaves the points nearest to the stamp: the caller checks the distance, and for NaN.
     """
-    if not values.any() or (len(values) > 1 and (values == values[0]).all()):
+    if tells_nothing(values):
         return None
     whole = values.dtype.kind in "iu"
     numbers = values.astype(np.int64 if whole else np.float64)

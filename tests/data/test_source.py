@@ -147,6 +147,14 @@ def test_point_times_are_used_unless_refused(drive: Path) -> None:
     assert scan_of(open_source(drive, sweep="instant")[0]).offsets_s is None
 
 
+@pytest.mark.parametrize("value", [0.0, 0.05])
+def test_point_times_that_are_all_the_same_are_none(drive: Path, value: float) -> None:
+    (drive / "velodyne_times").mkdir()
+    for k in range(FRAMES):
+        np.full(POINTS, value, "<f4").tofile(drive / f"velodyne_times/{k:06d}.bin")
+    assert scan_of(open_source(drive)[0]).offsets_s is None
+
+
 def test_point_times_from_azimuth(drive: Path) -> None:
     scan = scan_of(open_source(drive, sweep="azimuth")[1])
     assert scan.offsets_s is not None

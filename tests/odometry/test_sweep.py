@@ -28,6 +28,7 @@ from sst_graph.odometry.sweep import (
     with_sweep_of,
 )
 from sst_graph.odometry.sweep.estimate import CANDIDATES, SweepEvidence, estimate
+from sst_graph.odometry.sweep.given_times import turn_of
 from sst_graph.odometry.sweep.window import SECTORS, SweepWindow
 from sst_graph.result import CalibrationResult, FrameId
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate, write_drive
@@ -444,6 +445,59 @@ def test_points_that_were_moved_by_half_of_the_motion_contradict_every_hypothesi
     if in_part:
         assert "in them -0.5" in decision.contradiction and decision.contradiction in decision.sentence
         assert decision.given_as("compensated").contradiction == decision.contradiction
+
+
+class TimedHall(Hall):
+    """The same with times of the points, by the share of a turn of 0.1 s that is said to be in them."""
+
+    def __init__(self, fraction: float, told: float) -> None:
+        super().__init__(fraction, "auto")
+        self.told = told
+
+    def __getitem__(self, position: int) -> Frame:
+        scan = self.scan(position)
+        azimuths = np.arctan2(scan.points[:, 1], scan.points[:, 0]).astype(np.float64)
+        offsets_s = self.told * 0.1 * azimuths / (2.0 * np.pi)
+        return Frame(position, replace(scan, offsets_s=offsets_s.astype(np.float32)), None)
+
+
+@pytest.mark.parametrize(
+    ("fraction", "told", "wrong"),
+    [
+        (-1.0, -1.0, ""),
+        (0.0, -1.0, "the times of the points say clockwise, the scans compensated ("),  # and the times kept
+        (-1.0, 1.0, "the times of the points say counterclockwise, the scans clockwise ("),
+        (-1.0, -2.0, "the times of the points say clockwise, 0.2 s a turn, the scans clockwise ("),
+        (-1.0, 0.0, "the times of the points say compensated, the scans clockwise ("),
+        (-0.5, -1.0, "the times of the points say clockwise, the scans another sweep ("),
+        (-0.5, -0.5, ""),  # every second scan of a LiDAR that turns twice as fast
+    ],
+)
+def test_times_of_the_points_are_compared_with_the_scans(fraction: float, told: float, wrong: str) -> None:
+    source: Any = TimedHall(fraction, told)
+    swept = with_sweep(source)
+    decision = swept.sweep_decision
+    assert decision.kind == "given" and decision.contradiction.startswith(wrong)
+    assert bool(decision.contradiction) == bool(wrong)
+    np.testing.assert_array_equal(swept[3].scan.offsets_s, source[3].scan.offsets_s)  # type: ignore[union-attr]
+
+
+def test_times_that_do_not_follow_the_azimuth_are_of_no_turn() -> None:
+    scan = TimedHall(-1.0, -1.0)[0].scan
+    assert scan is not None and scan.offsets_s is not None
+    assert turn_of([scan]) == pytest.approx(-0.1, rel=0.02)
+    # Whatever the azimuth at which the turn begins, and where a quarter of it is out of view.
+    azimuths = np.arctan2(scan.points[:, 1], scan.points[:, 0])
+    share = np.mod(azimuths - 1.0, 2.0 * np.pi) / (2.0 * np.pi)
+    turned = replace(scan, offsets_s=(0.05 * share).astype(np.float32))
+    assert turn_of([turned]) == pytest.approx(0.05, rel=0.02)
+    seen = share < 0.75
+    part = Scan(0, scan.points[seen], scan.classes[seen], offsets_s=turned.offsets_s[seen])  # type: ignore[index]
+    assert turn_of([part]) == pytest.approx(0.05, rel=0.02)
+    rng = np.random.default_rng(0)
+    mixed = replace(scan, offsets_s=rng.permutation(scan.offsets_s))
+    assert turn_of([mixed]) is None and turn_of([scan, mixed]) is None
+    assert turn_of([]) is None and turn_of([replace(scan, offsets_s=None)]) is None
 
 
 def test_nothing_is_compared_where_the_sweep_is_known_or_not_to_be_decided() -> None:

@@ -37,6 +37,7 @@ from sst_graph.data.kitti.odometry_layout import (
 )
 from sst_graph.data.kitti.truth import drive_truth
 from sst_graph.data.pictures import PictureFiles, mask_encoding, point_labels
+from sst_graph.data.point_times import tells_nothing
 from sst_graph.data.scan_order import rings_from_order
 from sst_graph.data.source import Loader, SourceOptions
 from sst_graph.data.two_clocks import DriveProperties, IndexedSource, Sensor, TwoClockSource, merged
@@ -128,7 +129,8 @@ class KittiSource(IndexedSource):
         if self.timing is not None:
             return self.timing.offsets_s(points)
         if self.sweep == "auto" and self.files.point_times is not None:
-            return read_offsets(self.files.point_times[index], used)
+            offsets_s = read_offsets(self.files.point_times[index], used)
+            return None if tells_nothing(offsets_s[used]) else offsets_s
         return None
 
     def _image(self, index: int) -> CameraImage | None:

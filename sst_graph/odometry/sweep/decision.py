@@ -187,7 +187,10 @@ class _PairMotion:
 
 
 def decide_sweep(
-    scan_at: Callable[[int], Scan | None], count: int, stamp: SweepStamp = "forward"
+    scan_at: Callable[[int], Scan | None],
+    count: int,
+    stamp: SweepStamp = "forward",
+    max_windows: int = _MAX_WINDOWS,
 ) -> SweepDecision:
     """Decide the sweep from the scans of a drive that have no times of their points.
 
@@ -195,6 +198,7 @@ def decide_sweep(
         scan_at: scan at a position, or None where the frame has none.
         count: number of positions.
         stamp: the instant that a scan's stamp names, in case the points are as measured.
+        max_windows: most that are registered, as long as they may decide.
     """
     pairs = _pair_motions(scan_at, count)
     if not pairs:
@@ -220,10 +224,10 @@ def decide_sweep(
         used += positions
         decision = replace(_decide(windows, timing), frames=tuple(sorted(set(used))))
         _LOG.info("sweep: %s", decision.sentence)
-        if decision.kind != "undecided" or len(windows) == _MAX_WINDOWS:
+        if decision.kind != "undecided" or len(windows) == max_windows:
             break
         # Evidence of as many windows as may be registered, were they all like these.
-        expected = 0.5 / decision.sigma**2 * _MAX_WINDOWS / len(windows)
+        expected = 0.5 / decision.sigma**2 * max_windows / len(windows)
         if expected < _MIN_EXPECTED * -np.log(_ERROR_RATE):
             break
     return decision

@@ -14,12 +14,19 @@ from sst_graph.data.frame_parts import (
 from sst_graph.data.source_view import SourceView
 from sst_graph.errors import ConfigError
 from sst_graph.odometry.sweep.decision import CLAIMS, SweepDecision, decide_sweep
+from sst_graph.odometry.sweep.given_times import compared_with_times, turn_of
+from sst_graph.sampling import evenly_spread
 from sst_graph.sweep_timing import AT_ONCE, SweepStamp, SweepTiming
 from sst_graph.types import Frame, Scan, Source
 from sst_graph.validation import checked_position
 
 SWEEP_KEY = "sweep"
 """Where a result's diagnostics keep what was decided of the sweeps, by name of the drive."""
+
+_TIMED_SCANS = 3
+"""Scans, spread over the drive, whose times tell the turn."""
+_COMPARED_WINDOWS = 2
+"""Parts of a drive that are registered to compare given times with."""
 
 
 class SweptSource(SourceView):
@@ -59,11 +66,11 @@ def with_sweep(source: Source, decide: bool = True) -> SweptSource:
     """The source with times for its points, decided from its scans; scans read for that are not read again.
 
     Where its scans have times, nothing is decided, and the source stays as it is. So it does where it was
-    opened with a given sweep (its attribute ``sweep`` is other than "auto"); what is said of it by a word of
-    ``--sweep`` is compared with the scans.
+    opened with a given sweep (its attribute ``sweep`` is other than "auto"). What a spinning scanner's times,
+    or a word of ``--sweep``, say of it is compared with the scans.
 
     Args:
-        decide: False leaves scans without times as they are.
+        decide: False leaves scans without times as they are, and compares nothing.
 
     Raises:
         DataError: a frame cannot be read.
@@ -74,14 +81,27 @@ def with_sweep(source: Source, decide: bool = True) -> SweptSource:
     if not decide or word not in ("auto", *CLAIMS):
         return SweptSource(source, given)
     ahead = AheadReader(source)
-    if word == "auto" and _has_times(ahead):
-        return SweptSource(source, given, ahead)
     stamp: SweepStamp = getattr(source, "sweep_stamp", "forward")
     # Where frames have one sensor each, scans follow one another at positions that do not.
     positions = scan_positions(source)
-    decision = decide_sweep(lambda k: _without_times(ahead.look(positions[k])), len(positions), stamp)
+    turn_s = None
+    if word == "auto" and _has_times(ahead):
+        some = [ahead.look(k) for k in evenly_spread(positions, _TIMED_SCANS)]
+        turn_s = turn_of([scan for scan in some if scan is not None and len(scan.points)])
+        if turn_s is None:
+            return SweptSource(source, given, ahead)
+    decision = decide_sweep(
+        lambda k: _without_times(ahead.look(positions[k])),
+        len(positions),
+        stamp,
+        **({} if turn_s is None else {"max_windows": _COMPARED_WINDOWS}),
+    )
     decision = replace(decision, frames=tuple(positions[k] for k in decision.frames))
-    return SweptSource(source, decision if word == "auto" else decision.given_as(word), ahead)
+    if turn_s is not None:
+        decision = compared_with_times(decision, turn_s)
+    elif word != "auto":
+        decision = decision.given_as(word)
+    return SweptSource(source, decision, ahead)
 
 
 def _has_times(ahead: AheadReader) -> bool:
