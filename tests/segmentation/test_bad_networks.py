@@ -356,7 +356,9 @@ def test_labels_without_vehicles_say_what_calibrate_has_to_be_told(
 ) -> None:
     write_colour_network(tmp_path / "n.onnx")
     model = described(f"network: n.onnx\nclasses: {{0: pole, 1: ground, 2: fence}}\n{PLAIN}")(tmp_path)
-    assert main(["segment", str(kitti_drive), "--image-model", str(model), "--out", str(tmp_path / "out")]) == 0
+    assert (
+        main(["segment", str(kitti_drive), "--image-model", str(model), "--out", str(tmp_path / "out")]) == 0
+    )
     assert "knows no vehicles: calibrate with --classes pole,fence" in capsys.readouterr().err
 
 
