@@ -77,7 +77,7 @@ def test_evaluate_counts_the_truths_own_error(result_file: Path, capsys: pytest.
         ({"version": 2}, "version 2"),
         ({"covariance": np.zeros((7, 7)).tolist()}, "covariance: found a sigma of 0"),
         ({"covariance": (np.eye(7) + 0.1 * np.eye(7, k=1)).tolist()}, "not symmetric"),
-        ({"covariance": (3.0 * np.ones((7, 7)) - 4.0 * np.eye(7)).tolist()}, "variance of -1"),
+        ({"covariance": (1.5 * np.eye(7) - 0.5 * np.ones((7, 7))).tolist()}, "eigenvalue -2"),
         ({"camera": {"name": "image_2", "fx": 7, "fy": 7, "cx": 4, "cy": 3, "width": 0, "height": 6}}, "0x6"),
     ],
 )
