@@ -126,12 +126,21 @@ def nees(error: FloatArray, covariance: FloatArray) -> float:
     Raises:
         DataError: the covariance is not positive definite.
     """
+    root, sigmas = root_and_sigmas(covariance)
+    return float(np.sum(np.linalg.solve(root, error / sigmas) ** 2))
+
+
+def root_and_sigmas(covariance: FloatArray, place: str = "covariance") -> tuple[FloatArray, FloatArray]:
+    """Cholesky factor (n, n) of the correlations of a covariance (n, n), and its sigmas (n,).
+
+    Raises:
+        DataError: the covariance is not positive definite.
+    """
     sigmas = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
     try:
-        root = np.linalg.cholesky(covariance / np.outer(sigmas, sigmas))
+        return np.linalg.cholesky(covariance / np.outer(sigmas, sigmas)), sigmas
     except np.linalg.LinAlgError:
-        raise DataError("covariance", "a matrix that is not positive definite", "a covariance") from None
-    return float(np.sum(np.linalg.solve(root, error / sigmas) ** 2))
+        raise DataError(place, "a matrix that is not positive definite", "a covariance") from None
 
 
 def calibration_errors(

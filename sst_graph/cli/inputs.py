@@ -18,7 +18,8 @@ from sst_graph.data.info.facts import facts_of, spans_of
 from sst_graph.data.source import is_result, recognized
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.imports import ImportOptions, import_calibration
-from sst_graph.result import CalibrationResult, read_result
+from sst_graph.metrics import root_and_sigmas
+from sst_graph.result import CalibrationResult, read_result, result_file
 from sst_graph.timestamps import NS_PER_S, apart_s
 from sst_graph.types import Source
 
@@ -106,6 +107,17 @@ def given_result(path: Path) -> CalibrationResult:
     """
     refuse_drive(path)
     return read_result(path)
+
+
+def result_with_information(path: Path) -> CalibrationResult:
+    """The result at a path, whose covariance has an inverse.
+
+    Raises:
+        DataError: there is none that can be read, or its covariance is singular.
+    """
+    result = given_result(path)
+    root_and_sigmas(result.covariance, f"{result_file(path)}: covariance")
+    return result
 
 
 def refuse_drive(path: Path) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from sst_graph.cli.messages import complain
 from sst_graph.data.frame_parts import image_at, image_positions, scan_at, scan_positions
+from sst_graph.data.info.methods import WITHOUT_EDGES
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.sampling import evenly_spread
 from sst_graph.types import CameraImage, Scan, SemanticClass, Source
@@ -26,11 +27,7 @@ ALIGNABLE = tuple(
     if label not in (SemanticClass.OTHER, SemanticClass.IGNORE, SemanticClass.OBJECT)
 )
 """Classes that ``--classes`` takes."""
-_OF_OBJECTS = tuple(
-    label
-    for label in ALIGNABLE
-    if label not in (SemanticClass.GROUND, SemanticClass.TERRAIN, SemanticClass.SKY)
-)
+_OF_OBJECTS = tuple(label for label in ALIGNABLE if label not in WITHOUT_EDGES)
 """Those that stand before something else, and so have edges in a scan."""
 _FIRST = 8
 """Scans, or images, that are looked at before all others."""

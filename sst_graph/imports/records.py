@@ -18,7 +18,8 @@ from sst_graph.files.yaml_file import number, numbers
 from sst_graph.imports.document import Document
 from sst_graph.imports.frames import Found, ImportOptions, is_of_camera
 from sst_graph.marginal import CalibrationMarginal
-from sst_graph.result import UNNAMED_CAMERA
+from sst_graph.result import FORMAT as RESULT_FORMAT
+from sst_graph.result import UNNAMED_CAMERA, CalibrationResult
 
 Table = Mapping[str, Any]
 VEHICLE_FORMAT = "sst-graph/vehicle"
@@ -29,13 +30,16 @@ _MOST_RADIANS = 100.0
 
 def read_own(document: Document, options: ImportOptions) -> Found:
     """A JSON object with ``T_camera_lidar``, and where it is known ``time_offset_s`` and ``camera``; or a
-    vehicle's, which has these at its last drive.
+    vehicle's, which has these at its last drive. One that says that it is a result is checked as a whole.
 
     Raises:
-        DataError: another camera than the one asked for, no pose, no time offset.
+        DataError: another camera than the one asked for, no pose, no time offset; a damaged result.
     """
     table, taken = JsonTable(document.json, str(document.path)), "as it is"
     _check_camera(table.data.get("camera"), options.camera, document.path)
+    if table.data.get("format") == RESULT_FORMAT:
+        result = CalibrationResult.from_json(document.text, document.path)
+        return Found(result.T_camera_lidar, result.time_offset_s, taken)
     if table.data.get("format") == VEHICLE_FORMAT:
         if table.data.get("calibration") is None:
             raise DataError(document.path, "a vehicle without a calibration", "one with a drive that counts")

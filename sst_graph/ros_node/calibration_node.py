@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,12 @@ from sst_graph.cameras import Rectification
 from sst_graph.classes import MaskEncoding
 from sst_graph.data.lidar_pose import TimingFromCloud, in_lidar_axes, parse_lidar_pose
 from sst_graph.data.ros.bag import TF_MESSAGE
-from sst_graph.data.ros.camera_info import ImageGeometry, image_geometry
+from sst_graph.data.ros.camera_info import (
+    ImageGeometry,
+    has_matrix,
+    image_geometry,
+    is_other_camera,
+)
 from sst_graph.data.ros.frames import CloudReading, check_size, mask_classes, scan_of
 from sst_graph.data.ros.images import picture_of
 from sst_graph.data.ros.topics import CLOUD, COMPRESSED, IMAGE, INFO
@@ -78,6 +84,7 @@ class CalibrationNode:
         self._halves: dict[int, dict[str, tuple[Any, str]]] = {}
         self._unpaired = 0
         self._info: Any = None
+        self._other_infos = 0
         self._geometry: ImageGeometry | None = None
         self._rectification: Rectification | None = None
         self._transforms = Transforms()
@@ -160,9 +167,19 @@ class CalibrationNode:
         return self._received(self.lidar, now_ns, take)
 
     def add_info(self, message: Any, now_ns: int) -> None:
-        """A CameraInfo; the first one that can be used counts."""
+        """A CameraInfo; the first one that can be used counts, those of another camera are counted."""
         if self._geometry is None:
             self._info = message
+            return
+        try:
+            if is_other_camera(self._info, message):
+                size, place = (int(message.width), int(message.height)), self.settings.info_topic
+                if not has_matrix(message):
+                    raise DataError(place, "K = 0, an uncalibrated camera", "a calibrated one")
+                image_geometry(message, self.camera.topic, size, place)
+                self._other_infos += 1
+        except Exception as error:
+            self.info.refuse(_reason(error), now_ns)
 
     def add_transforms(self, message: Any, now_ns: int) -> None:
         """A TFMessage of /tf_static."""
@@ -176,6 +193,7 @@ class CalibrationNode:
         sensors = [self.camera, self.lidar, *([self.masks] if self.settings.mask_topic else [])]
         behind_s = max(one.waited_s for one in sensors)
         found = [one.diagnosis(now_ns, self.settings.silent_s) for one in sensors]
+        found[0] = self._with_camera_infos(found[0], now_ns)
         if self.update is None:
             found.insert(0, Diagnosis("calibration", WARN, self.state, {}))
         else:
@@ -326,6 +344,23 @@ class CalibrationNode:
             self.masks.used += 1
         image = CameraImage(one.stamp_ns, mask, pixels)
         return image if self._rectification is None else self._rectification.image(image)
+
+    def _with_camera_infos(self, camera: Diagnosis, now_ns: int) -> Diagnosis:
+        """The diagnosis of the camera with what its CameraInfo say: those refused, and of another camera."""
+        others, info = self._other_infos, self.info
+        words = [f"CameraInfo refused: {info.error}"] if info.has_recent_error(now_ns) else []
+        if others:
+            count = count_of(others, "CameraInfo", "CameraInfo")
+            words.append(
+                f"{count} of another camera than the first, whose model is used: "
+                "restart the node if the camera changed"
+            )
+        values = {**camera.values, "other_camera_infos": others, "refused_camera_infos": info.refused}
+        if not words:
+            return dataclasses.replace(camera, values=values)
+        if camera.level != OK:
+            words.insert(0, camera.message)
+        return Diagnosis(camera.name, max(camera.level, WARN), "; ".join(words), values)
 
     def _diagnosis_of_queue(self, behind_s: float) -> Diagnosis:
         """What waits here, and whether more waits to be taken: for how long is ``behind_s`` [s]."""

@@ -59,6 +59,10 @@ class SensorRecord:
         self.refused += 1
         self.error, self.error_ns = " ".join(why.split())[:300], now_ns
 
+    def has_recent_error(self, now_ns: int) -> bool:
+        """Whether a message was refused a short time ago."""
+        return _recent(self.error_ns, now_ns)
+
     def lose(self, count: int, now_ns: int) -> None:
         """Note messages that the network lost."""
         self.lost += count
@@ -88,7 +92,7 @@ class SensorRecord:
         silence_s = 1e-9 * (now_ns - self.last_ns)
         if silence_s > silent_s and not taken:
             return Diagnosis(self.name, STALE, f"no message on {self.topic} for {silence_s:.1f} s", values)
-        if _recent(self.error_ns, now_ns):
+        if self.has_recent_error(now_ns):
             return Diagnosis(self.name, WARN if self.used else ERROR, self.error, values)
         if _recent(self.lost_ns, now_ns):
             words = f"{count_of(self.lost, 'message')} lost by the network"

@@ -47,6 +47,7 @@ FORMAT = "sst-graph/labels"
 VERSION = 1
 _MODEL_FILE = "model.json"
 _MODEL = FileKind("the model.json of stored labels", 64 * 1024)
+_INSTANCES = ".instances.png"
 _DIGITS = 16
 """Of a network's identity in the name of its folder: 2^-32 for a collision among 65,000 networks."""
 
@@ -79,7 +80,7 @@ class LabelStore:
     folder: Path
 
     def models(self, side: Side) -> list[StoredModel]:
-        """Networks whose labels are stored.
+        """Networks that have a place here, also those of which no label is stored yet.
 
         Raises:
             DataError: a model.json that is damaged.
@@ -96,7 +97,7 @@ class LabelStore:
         Raises:
             ConfigError: there are several.
         """
-        models = self.models(side)
+        models = [model for model in self.models(side) if self._has_labels(side, model.identity)]
         if len(models) > 1:
             named = ", ".join(f"{one.name} ({one.identity[:_DIGITS]})" for one in models)
             option = "--image-model" if side == "images" else "--lidar-model"
@@ -170,6 +171,12 @@ class LabelStore:
         numbers = semantic_kitti_of(labels.classes, labels.instances)
         atomic_write_bytes(self._scan_path(model, scan), numbers.astype("<u4").tobytes())
 
+    def _has_labels(self, side: Side, model: str) -> bool:
+        """Whether the labels of a picture or a scan are stored, whole."""
+        names = (place.name for place in self._place(side, model).iterdir())
+        suffix = ".png" if side == "images" else ".label"
+        return any(name.endswith(suffix) and not name.endswith(_INSTANCES) for name in names)
+
     def _place(self, side: Side, model: str) -> Path:
         return self.folder / side / model[:_DIGITS]
 
@@ -183,7 +190,7 @@ class LabelStore:
 
 
 def _instances_path(path: Path) -> Path:
-    return path.with_suffix(".instances.png")
+    return path.with_suffix(_INSTANCES)
 
 
 def _key(*arrays: NDArray[Any]) -> str:

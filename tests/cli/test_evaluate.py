@@ -71,6 +71,41 @@ def test_evaluate_counts_the_truths_own_error(result_file: Path, capsys: pytest.
     assert "expected three numbers" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"version": 2}, "version 2"),
+        ({"covariance": np.zeros((7, 7)).tolist()}, "covariance: found a sigma of 0"),
+        ({"covariance": (np.eye(7) + 0.1 * np.eye(7, k=1)).tolist()}, "not symmetric"),
+        ({"covariance": (1.5 * np.eye(7) - 0.5 * np.ones((7, 7))).tolist()}, "eigenvalue -2"),
+        ({"camera": {"name": "image_2", "fx": 7, "fy": 7, "cx": 4, "cy": 3, "width": 0, "height": 6}}, "0x6"),
+    ],
+)
+def test_a_damaged_result_is_no_truth(
+    change: dict[str, object], words: str, result_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    damaged = result_file.with_name("damaged.json")
+    damaged.write_text(json.dumps({**json.loads(result_file.read_text()), **change}))
+    for command in (["evaluate", str(result_file), "--truth", str(damaged)], ["import", str(damaged)]):
+        assert main(command) == 2
+        said = capsys.readouterr().err
+        assert "damaged.json" in said and words in said
+
+
+@pytest.mark.parametrize("command", ["evaluate", "inspect", "export"])
+def test_a_singular_covariance_is_named_with_its_file(
+    command: str, result_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    values = json.loads(result_file.read_text())
+    values["covariance"][0][1] = values["covariance"][1][0] = values["covariance"][0][0]
+    result_file.write_text(json.dumps(values))
+    truth = str(result_file.with_name("truth.json"))
+    options = {"evaluate": ["--truth", truth], "inspect": [], "export": ["--to", "gtsam"]}[command]
+    assert main([command, str(result_file.parent), *options]) == 2
+    said = capsys.readouterr().err
+    assert str(result_file) in said and ("singular" in said or "not positive definite" in said)
+
+
 def test_evaluate_against_a_kitti_calibration(
     result_file: Path, kitti_drive: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -137,7 +137,8 @@ def saved(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["--init", "none"], "a start from T_camera_lidar"),
         (["--init", "none"], ", not from --init none"),
         (["--frames", "1:20"], "another drive (no image of 0 ns in"),
-        (["--image-shift", "1"], "another drive (another image of 0 ns in"),
+        (["--image-shift", "1"], "a tracker with --image-shift 0, not 1, expected what it was made with"),
+        (["--image-shift", "-1"], "a tracker with --image-shift 0, not -1"),
     ],
 )
 def test_resumed_on_other_frames_or_settings(

@@ -294,6 +294,31 @@ def test_a_start_is_of_the_node_s_camera_whatever_its_name(tmp_path: Path) -> No
         CalibrationNode(dataclasses.replace(SETTINGS, init=str(tmp_path / "nowhere.json")))
 
 
+def test_a_camera_info_of_another_camera_is_warned_of(bag: Any, config: TrackerConfig) -> None:
+    """Equal ones are silent; one that cannot be used is refused."""
+    node = CalibrationNode(SETTINGS, config)
+    messages = _messages(bag)[:FEW]
+    info = next(one[3] for one in messages if one[0] == INFO)
+    other_stamp = dataclasses.replace(info, header=Messages().header(EPOCH_NS + 1, "elsewhere"))
+    now_ns = messages[-1][2]
+    _play(node, [*messages, (INFO, "", now_ns, other_stamp)])
+    assert _diagnostics(node, now_ns)["camera"].level == 0
+    for number, change in enumerate(({"k": info.k + 5.0 * np.eye(3).ravel()}, {"width": info.width + 8}), 1):
+        node.add_info(dataclasses.replace(info, **change), now_ns)
+        camera = _diagnostics(node, now_ns)["camera"]
+        assert camera.level == 1 and camera.message == (
+            f"{number} CameraInfo of another camera than the first, whose model is used: "
+            "restart the node if the camera changed"
+        )
+    wrong = ({"p": np.full(12, np.nan)}, {"k": np.zeros(9)}, {"binning_x": 2})
+    for number, (change, words) in enumerate(zip(wrong, ("P", "K = 0", "binning"), strict=True), 1):
+        node.add_info(dataclasses.replace(info, **change), now_ns)
+        camera = _diagnostics(node, now_ns)["camera"]
+        assert camera.message.startswith(f"CameraInfo refused: {INFO}") and words in camera.message
+        values = {one.key: one.value for one in camera.values}
+        assert (values["other_camera_infos"], values["refused_camera_infos"]) == ("2", str(number))
+
+
 def test_queues_are_bounded(bag: Any, config: TrackerConfig) -> None:
     settings = dataclasses.replace(SETTINGS, queue=4)
     node = CalibrationNode(settings, config)

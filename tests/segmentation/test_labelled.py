@@ -186,6 +186,23 @@ def test_a_damaged_model_file_is_named(text: str, tmp_path: Path) -> None:
         with_labels(drive_of(), None, None, tmp_path)
 
 
+def test_a_network_without_a_stored_label_is_not_chosen(tmp_path: Path) -> None:
+    """A run that fails before its first label leaves a folder of its network."""
+
+    class Failing(Threshold):
+        def segment(self, image: CameraImage) -> ImageLabels:
+            raise DataError(self.name, "no picture that it can label", "one")
+
+    with pytest.raises(DataError, match="above 50"):
+        segment_drive(with_labels(drive_of(), Failing(50), None, tmp_path))
+    assert store_to_fill(tmp_path).folder == tmp_path
+    with pytest.raises(ConfigError, match="found no labels, expected those"):
+        with_labels(drive_of(), None, None, tmp_path)
+    segment_drive(with_labels(drive_of(), Threshold(100), None, tmp_path))
+    chosen = with_labels(drive_of(), None, None, tmp_path).labelling.images
+    assert chosen is not None and chosen.name == "above 100"
+
+
 def test_labels_of_another_shape_are_refused(tmp_path: Path) -> None:
     class Small(Threshold):
         def segment(self, image: CameraImage) -> ImageLabels:

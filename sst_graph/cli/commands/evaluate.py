@@ -6,7 +6,7 @@ import argparse
 import dataclasses
 import json
 
-from sst_graph.cli.inputs import given_result
+from sst_graph.cli.inputs import result_with_information
 from sst_graph.cli.messages import complain, say
 from sst_graph.cli.options import SOURCE_DEFAULTS
 from sst_graph.cli.reading import open_drive_of, reading_words
@@ -20,7 +20,7 @@ from sst_graph.types import GroundTruth
 
 def run(args: argparse.Namespace) -> int:
     """Print the errors of ``args.result`` against ``args.truth``."""
-    result = given_result(args.result)
+    result = result_with_information(args.result)
     truth = _truth(args, result)
     sigma = None if args.truth_sigma is None else _truth_sigma(args.truth_sigma)
     estimate = result.T_camera_lidar, result.time_offset_s

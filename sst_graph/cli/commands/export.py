@@ -9,7 +9,7 @@ from sst_graph.cli.inputs import refuse_drive
 from sst_graph.cli.messages import complain, loudness, mention, say
 from sst_graph.cli.output_places import check_apart
 from sst_graph.data.kitti.calib import read_calibration
-from sst_graph.errors import ConfigError
+from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.export import ExportOptions, export_text
 from sst_graph.export.text import heading
 from sst_graph.files import output_file
@@ -56,7 +56,10 @@ def _text(args: argparse.Namespace) -> str:
         None if args.tree is None else read_tree(args.tree),
         None if args.calib is None else read_calibration(args.calib),
     )
-    text = export_text(result, args.to, options)
+    try:
+        text = export_text(result, args.to, options)
+    except EstimationError as error:
+        raise EstimationError(f"{_file(args.result)}: {error}") from error
     if result.status != "ok":
         reasons = " ".join("; ".join(_reasons(result)).split())
         complain(f"warning: {result.status}, exported all the same" + (f": {reasons}" if reasons else ""))

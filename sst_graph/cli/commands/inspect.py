@@ -6,7 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
-from sst_graph.cli.inputs import given_result
+from sst_graph.cli.inputs import result_with_information
 from sst_graph.cli.messages import say
 from sst_graph.cli.output_places import check_apart
 from sst_graph.cli.reading import checked_options, reading_words
@@ -30,10 +30,10 @@ def run(args: argparse.Namespace) -> int:
     check_apart({"RESULT": result_file(args.result)}, {"--plots": args.plots})
     names = []
     if args.plots is None:
-        inspection = inspect_result(given_result(args.result), args.next)
+        inspection = inspect_result(result_with_information(args.result), args.next)
     else:
         with atomic_directory(args.plots, args.overwrite, PLOTS) as folder:
-            inspection = inspect_result(given_result(args.result), args.next)
+            inspection = inspect_result(result_with_information(args.result), args.next)
             names = _write_plots(inspection, folder)
     read_as = checked_options(inspection.result.read_as, result_file(args.result))
     if args.json:

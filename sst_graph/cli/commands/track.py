@@ -176,6 +176,7 @@ def _begun(args: argparse.Namespace, source: Source) -> tuple[Tracker, SweptSour
         config = dataclasses.replace(config, calibration=_with_method(config.calibration, source))
         swept = with_sweep(source, config.calibration.decide_sweep)
         tracker = Tracker(source.camera, config, initial, time_offset_s, swept.sweep_decision)
+        tracker.setup = dataclasses.replace(tracker.setup, image_shift=args.image_shift)
         return tracker, swept, iter(swept)
     made = checkpoint_setup(args.checkpoint)
     initial, time_offset_s = made.initial, made.initial_time_offset_s
@@ -185,7 +186,7 @@ def _begun(args: argparse.Namespace, source: Source) -> tuple[Tracker, SweptSour
     if args.method == "auto":
         del flags["calibration.method"]
     asked = settings(made.config, args, flags)
-    setup = Setup(source.camera, asked, initial, time_offset_s)
+    setup = Setup(source.camera, asked, initial, time_offset_s, args.image_shift)
     swept = with_sweep(source, made.config.calibration.decide_sweep)
     tracker = Tracker.load(args.checkpoint, setup, swept.sweep_decision)
     return tracker, swept, frames_to_come(tracker, swept, args.checkpoint)

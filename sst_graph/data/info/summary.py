@@ -153,6 +153,8 @@ def drive_info(source: Source) -> DriveInfo:
         nominal=source.nominal is not None,
         black=_black(images),
         together=_together(scan_sensor, image_sensor),
+        scans_looked_at=len(scans),
+        images_looked_at=len(images),
     )
     return DriveInfo(
         name=source.name,

@@ -45,6 +45,21 @@ def has_matrix(message: Any) -> bool:
     return bool(np.any(getattr(message, "k", getattr(message, "K", ()))))
 
 
+def is_other_camera(first: Any, message: Any) -> bool:
+    """Whether a CameraInfo differs from the first of its topic in any field but the header."""
+    mine, others = ({**vars(one), "header": ""} for one in (first, message))
+    return mine.keys() != others.keys() or not all(_same(mine[key], others[key]) for key in mine)
+
+
+def _same(a: Any, b: Any) -> bool:
+    """Whether two fields are equal; NaN is equal to NaN."""
+    if hasattr(a, "__dict__") and hasattr(b, "__dict__"):
+        return not is_other_camera(a, b)  # the region of interest
+    if isinstance(a, str) or isinstance(b, str):
+        return bool(a == b)
+    return np.array_equal(np.asarray(a, np.float64), np.asarray(b, np.float64), equal_nan=True)
+
+
 def geometry_by_file(path: Path, image_topic: str, size: Size) -> ImageGeometry:
     """Geometry of images of ``size`` by a file: the camera as the images are, rectified or not.
 

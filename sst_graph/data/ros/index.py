@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.data.ros.bag import Bag, Message
-from sst_graph.data.ros.camera_info import has_matrix
+from sst_graph.data.ros.camera_info import has_matrix, is_other_camera
 from sst_graph.data.ros.topics import Topics
 from sst_graph.data.ros.transforms import Transforms
 from sst_graph.data.source import Stamps
@@ -113,7 +113,8 @@ class _CameraInfos:
         if self.first is None or not has_matrix(self.first):
             self.first, self._bytes, self.others = bag.decoded(data, type_name), content, 0
         elif content != self._bytes:
-            self.others += has_matrix(bag.decoded(data, type_name))
+            message = bag.decoded(data, type_name)
+            self.others += has_matrix(message) and is_other_camera(self.first, message)
 
 
 def _rising(bag: Bag, topic: str, stamped: list[Stamped]) -> tuple[Stamped, ...]:

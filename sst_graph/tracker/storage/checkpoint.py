@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from sst_graph.tracker.tracker import Tracker
 
 FORMAT = "sst-graph/tracker"
-VERSION = 35
+VERSION = 36
 """Goes up whenever what a tracker holds changes: a checkpoint is for the version that wrote it."""
 
 CHECKPOINT = FileKind("a checkpoint of the tracker", 512 * 1024 * 1024)

@@ -36,12 +36,15 @@ class Setup:
         config: all settings.
         initial: guess of cTl, or None.
         initial_time_offset_s: guess of the time offset [s].
+        image_shift: of its drive (:func:`~sst_graph.data.open_source`): image k + image_shift has the stamp
+            of image k.
     """
 
     camera: PinholeCamera
     config: TrackerConfig
     initial: gtsam.Pose3 | None
     initial_time_offset_s: float
+    image_shift: int = 0
 
     def differences(self, other: Setup) -> list[str]:
         """In what another one differs: "name, and not the other's"."""
@@ -51,6 +54,8 @@ class Setup:
             for name in {**mine, **others}
             if mine.get(name) != others.get(name)
         ]
+        if self.image_shift != other.image_shift:
+            found.append(f"--image-shift {self.image_shift}, not {other.image_shift}")
         if self.camera != other.camera:
             found.append(f"a camera {self.camera}, not {other.camera}")
         if (
@@ -112,7 +117,7 @@ def check_inputs(tracker: Tracker) -> None:
 
 
 def check_setup(tracker: Tracker, setup: Setup, place: str | Path) -> None:
-    """Refuse a tracker that was made with another camera, other settings or another guess.
+    """Refuse a tracker that was made with another camera, other settings, pairs or another guess.
 
     Raises:
         DataError: it was; each difference is named.

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from tiny_networks import colour_yaml, write_colour_network
 
 from sst_graph import open_source
 from sst_graph.cli import main
@@ -43,6 +44,45 @@ def test_what_is_missing_for_which_method() -> None:
         "a class that points and masks both have", "a nominal extrinsic (--init none does without)"
     )  # fmt: skip
     assert found["paper"][-1] == "a nominal extrinsic (--init FILE gives a start)"
+
+
+@pytest.mark.parametrize(
+    ("points", "masks", "looked_at", "words"),
+    [
+        ({"vehicle", "pole"}, {"pole"}, 5, "pixels labelled vehicle in the 5 images looked at{pole}"),
+        ({"vehicle", "pole"}, {"pole"}, 20, "pixels labelled vehicle{pole}"),
+        ({"pole"}, {"vehicle", "pole"}, 5, "points labelled vehicle in the 5 scans looked at{pole}"),
+        (
+            {"pole", "ground"},
+            {"pole", "ground"},
+            None,
+            "points labelled vehicle and pixels labelled vehicle{pole}",
+        ),
+        ({"ground"}, {"ground"}, None, "points labelled vehicle and pixels labelled vehicle"),
+    ],
+)
+def test_labels_without_the_class_that_is_aligned(
+    points: set[str], masks: set[str], looked_at: int | None, words: str
+) -> None:
+    content = Content(20, 20, True, frozenset(points), frozenset(masks), True)
+    found = missing_for(replace(content, scans_looked_at=looked_at, images_looked_at=looked_at))
+    said = words.format(pole=" (or name other classes: --classes pole)")
+    by_labels = ("joint", "both", "paper", "semalign", "track")
+    assert found == {method: (said,) if method in by_labels else () for method in METHODS}
+
+
+def test_labels_of_networks_without_vehicles(
+    kitti_drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The network knows poles, ground and sky; all pixels of the drive are ground to it."""
+    model = colour_yaml(write_colour_network(tmp_path / "n.onnx"))
+    model.write_text(model.read_text().replace("vehicle", "pole"))
+    options = ["--image-model", str(model), "--labels", str(tmp_path / "labels")]
+    assert main(["info", str(kitti_drive), *options, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["images"]["classes"] == ["ground"]
+    for method in ("joint", "both", "paper", "semalign", "track"):
+        assert found["missing"][method] == ["pixels labelled vehicle"]
 
 
 def test_stamps_of_two_clocks_that_share_no_time_are_named(kitti_drive: Path) -> None:
