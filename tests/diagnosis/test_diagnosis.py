@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -121,9 +122,9 @@ def causes(data: KeptDrive, config: CalibrationConfig | None = None) -> list[str
     return [finding.sentence for finding in preflight(drives, Guess(data.nominal, 0.0), CLASSES)]
 
 
-def test_right_data_are_left_alone() -> None:
-    assert causes(drive()) == []
-    assert causes(other()) == []
+@pytest.mark.parametrize("right", [pytest.param(drive, marks=pytest.mark.slow), other])
+def test_right_data_are_left_alone(right: Callable[[], KeptDrive]) -> None:
+    assert causes(right()) == []
 
 
 @pytest.mark.parametrize("fault", BY_THEMSELVES)
@@ -478,6 +479,7 @@ def test_it_is_a_remark_unless_it_is_said_how_far_it_may_be_off() -> None:
     assert reasons() == ()
 
 
+@pytest.mark.slow
 def test_frames_without_labels_are_named_where_the_result_is_not_ok() -> None:
     def bare(frame: Frame) -> Frame:
         assert frame.scan is not None
