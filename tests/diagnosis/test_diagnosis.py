@@ -560,6 +560,10 @@ def test_a_result_a_baseline_from_the_start_is_another_camera() -> None:
     right = gtsam.Pose3(gtsam.Rot3(), np.array([-0.54, 0.0, 0.0])) * CTL
     finding = other_camera(CTL, right, covariance)
     assert finding is not None and "54 cm to the right" in finding.cause
+    # Pictures may be right where masks alone are exchanged: only those were compared.
+    assert finding.cause.startswith("the masks (or the pictures with them) are those of another camera")
+    by_edges = other_camera(CTL, right, covariance, by_labels=False)
+    assert by_edges is not None and by_edges.cause.startswith("the pictures are those of another camera")
     forward = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, 0.54])) * CTL
     assert other_camera(CTL, forward, covariance) is None
     assert other_camera(CTL, right, np.eye(7) * 0.2**2) is None
