@@ -136,7 +136,8 @@ def test_into_the_tree_of_a_vehicle(
     assert "found no frame 'lidar' among base_link, velodyne" in capsys.readouterr().err
 
 
-ROOFED = """<robot name="v"><joint name="a" type="fixed"><parent link="base_link"/><child link="roof"/></joint>
+ROOFED = """<robot name="v">
+<joint name="a" type="fixed"><parent link="base_link"/><child link="roof"/></joint>
 <joint name="b" type="fixed"><parent link="roof"/><child link="velodyne"/></joint>
 <joint name="c" type="fixed"><parent link="base_link"/><child link="imu"/></joint>
 <joint name="d" type="fixed"><parent link="roof"/><child link="camera_link"/></joint></robot>"""

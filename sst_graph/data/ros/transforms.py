@@ -52,8 +52,8 @@ class Transforms:
     def beside(self, other: Transforms) -> Transforms:
         """What is left of these where another file's take their place.
 
-        A frame that has a pose there has none here. Where its parent there is below it here, the parent has no
-        pose here either: it would be above and below at once.
+        A frame that has a pose there has none here. Where its parent there is below it here, the parent has
+        no pose here either: it would be above and below at once.
         """
         kept = self._without({child for _, child in other._poses})
         for parent, child in other._poses:
