@@ -235,7 +235,7 @@ NAMED: dict[str, str] = {
     "Tr inverted": "the start (Tr) is inverted",
     "Tr in mm": "the translation of the start (Tr) is in millimetres",
     "radians as degrees": "radians that were taken as degrees",
-    "Tr of the right camera": "the pictures are those of another camera",
+    "Tr of the right camera": "are those of another camera",
     "x flipped": "x axis is flipped",
     "y flipped": "mirrored",
     "turned by 180 deg": "the clouds are turned by 180 deg",
@@ -258,6 +258,6 @@ NAMED: dict[str, str] = {
     "only background": "no point is labelled vehicle",
     "masks shifted 3 px": "the masks are shifted right",
     "masks shifted 6 px": "the masks are shifted right",
-    "right camera": "the pictures are those of another camera",
+    "right camera": "are those of another camera",
 }
 """Words of the sentence that names each fault rightly; no data show that all stamps are doubled."""

@@ -63,7 +63,7 @@ def with_causes(
         axes = other_axes(drives)
         causes = [] if axes is None else [axes.sentence]
     if not causes and estimated:
-        camera = other_camera(guess.cTl, result.T_camera_lidar, result.covariance)
+        camera = other_camera(guess.cTl, result.T_camera_lidar, result.covariance, by_labels)
         causes = [] if camera is None else [camera.sentence]
     if not causes and config.find_causes and config.method == "joint":
         causes = [finding.sentence for finding in _fault_hypotheses(result, drives, guess, config)]

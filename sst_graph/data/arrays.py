@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.errors import DataError, count_of
+from sst_graph.errors import DataError, count_of, printable
 from sst_graph.files.reading import FileKind, read_file
 from sst_graph.validation import FARTHEST_M
 
@@ -144,13 +144,18 @@ def check_metres(points: NDArray[np.float32], path: Path) -> None:
         raise DataError(path, found, f"metres in float32, at most {FARTHEST_M:g}")
 
 
-def read_labels(path: Path, count: int) -> NDArray[np.uint32]:
+def read_labels(path: Path, count: int, cloud: Path | None = None) -> NDArray[np.uint32]:
     """Labels (n,) uint32 of a SemanticKITTI file for ``count`` points.
+
+    Args:
+        cloud: file of the points, which is named where it has none.
 
     Raises:
         DataError: a missing or truncated file, or another number of labels than points.
     """
     labels = _values(read_file(path, LABELS), path, "<u4", 1, "one uint32 a point")
+    if cloud is not None and count == 0 and len(labels):
+        raise DataError(cloud, "no point", f"{len(labels)}, as many as {printable(path)} has labels")
     _check_count(path, len(labels), count, "labels")
     return labels
 

@@ -66,11 +66,14 @@ def mask_encoding(masks: Mapping[int, Path], wanted: LabelEncoding, size: tuple[
     return guess_mask_encoding((read_mask(path, size) for path in chosen), paths[0].parent)
 
 
-def point_labels(path: Path | None, used: NDArray[np.bool_]) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
+def point_labels(
+    path: Path | None, used: NDArray[np.bool_], cloud: Path
+) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
     """Classes and instances of a scan's used points by a SemanticKITTI file; without one, any class.
 
     Args:
         used: (n,) False for points that are left out.
+        cloud: file of the points.
 
     Raises:
         DataError: a damaged file, another number of labels than points, an unknown class.
@@ -78,4 +81,4 @@ def point_labels(path: Path | None, used: NDArray[np.bool_]) -> tuple[NDArray[np
     if path is None:
         count = int(used.sum())
         return np.full(count, SemanticClass.IGNORE, np.uint8), np.zeros(count, np.uint16)
-    return classes_of_points(read_labels(path, len(used))[used], path)
+    return classes_of_points(read_labels(path, len(used), cloud)[used], path)

@@ -61,12 +61,15 @@ def start_finding(guess: gtsam.Pose3, found: LabelFit, finding: Finding) -> Find
     return finding
 
 
-def other_camera(guess: gtsam.Pose3 | None, result: gtsam.Pose3, covariance: FloatArray) -> Finding | None:
-    """A result that is parallel to the start and shifted sideways by a stereo baseline: pictures of the other
-    camera.
+def other_camera(
+    guess: gtsam.Pose3 | None, result: gtsam.Pose3, covariance: FloatArray, by_labels: bool = True
+) -> Finding | None:
+    """A result that is parallel to the start and shifted sideways by a stereo baseline: the images are of the
+    other camera.
 
     Args:
         covariance: (7, 7) of the result.
+        by_labels: the result is by masks, not by what the pictures show.
     """
     if guess is None or quaternion_angle_deg(guess.rotation(), result.rotation()) > _ALIGNED_DEG:
         return None
@@ -79,10 +82,12 @@ def other_camera(guess: gtsam.Pose3 | None, result: gtsam.Pose3, covariance: Flo
     if abs(way[0]) < _SIGMAS * sigma:
         return None
     side = "right" if way[0] < 0.0 else "left"
+    compared = "the masks (or the pictures with them)" if by_labels else "the pictures"
+    folder = "masks, and that of the pictures," if by_labels else "pictures"
     return Finding(
-        f"the pictures are those of another camera, {100.0 * abs(way[0]):.0f} cm to the {side}",
+        f"{compared} are those of another camera, {100.0 * abs(way[0]):.0f} cm to the {side}",
         f"along the camera's x axis the start is {-100.0 * way[0]:+.0f} +- {100.0 * sigma:.0f} cm off",
-        "compare the folder of the pictures with the camera (P0 to P3) of the calibration",
+        f"compare the folder of the {folder} with the camera (P0 to P3) of the calibration",
     )
 
 

@@ -65,6 +65,25 @@ def export_text(
     ):
         if value is not None and target not in formats:
             raise ConfigError(f"{name} goes with --to {', '.join(formats)}, found --to {target}")
+    return FORMATS[target](_rig(result, options))
+
+
+def replaced_joints(
+    result: CalibrationResult | RigResult, target: str, options: ExportOptions | None = None
+) -> list[str]:
+    """Joints of the vehicle's tree, but for those of the cameras, that the exported text replaces.
+
+    Args:
+        result, target, options: as of :func:`export_text`, which takes them.
+
+    Returns:
+        A sentence for each, with what it cuts off.
+    """
+    options = ExportOptions() if options is None else options
+    return _rig(result, options).replacements() if target in _EITHER_WAY else []
+
+
+def _rig(result: CalibrationResult | RigResult, options: ExportOptions) -> Rig:
     if isinstance(result, RigResult):
-        return FORMATS[target](rig_of(result.cameras, options, several=True))
-    return FORMATS[target](rig_of({result.camera_name: result}, options, several=False))
+        return rig_of(result.cameras, options, several=True)
+    return rig_of({result.camera_name: result}, options, several=False)

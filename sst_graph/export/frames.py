@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
 
+from sst_graph.data.ros.transforms import Transforms
 from sst_graph.errors import ConfigError
 from sst_graph.export.options import CAMERA, NUMBER, ExportOptions
 from sst_graph.export.text import heading
@@ -82,8 +83,9 @@ class Rig:
         """
         tree, lidar = self.options.tree, self.options.lidar_frame
         if tree is not None and lidar not in tree.frames:
-            listed = ", ".join(tree.frames[:12]) + (", ..." if len(tree.frames) > 12 else "")
-            raise ConfigError(f"--tree: found no frame {lidar!r} among {listed}; name it by --lidar-frame")
+            raise ConfigError(
+                f"--tree: found no frame {lidar!r} among {_listed(tree.frames)}; name it by --lidar-frame"
+            )
 
     def link_from_optical(self, name: str) -> gtsam.Pose3:
         """Pose of a camera's optical frame in its link: the vehicle's, or REP 103's."""
@@ -117,6 +119,34 @@ class Rig:
                 f"{self.options.lidar_frame}, or name the cameras' frames with {CAMERA})"
             )
         return found
+
+    def replacements(self) -> list[str]:
+        """The tree's own joints that the transforms take the place of, each in a sentence.
+
+        That of a camera's frame is what the tree is given for, and is left out.
+
+        Raises:
+            ConfigError: as :meth:`transforms`.
+        """
+        tree, transforms = self.options.tree, self.transforms()
+        if tree is None:
+            return []
+        of_cameras = {name for one in self.frames.values() for name in (one.optical, one.link)}
+        written = Transforms()
+        for one in transforms:
+            written.add_pose(one.parent, one.child, one.pose)
+        after = written.joined(tree.beside(written))
+        said = []
+        for child in dict.fromkeys(one.child for one in transforms if one.child not in of_cameras):
+            parents = tree.parents(child)
+            if parents:
+                apart = [frame for frame in tree.frames if not after.connected(child, frame)]
+                cut = f", which cuts {_listed(apart)} off from {child}" if apart else ""
+                above = ", ".join(parents)
+                said.append(
+                    f"{child} has a parent in the tree already, {above}: the file replaces that joint{cut}"
+                )
+        return said
 
     def words(self, transforms: list[StaticTransform]) -> list[str]:
         """The transforms in sentences: axes, direction, time offset and its sign, deviations."""
@@ -204,6 +234,10 @@ def rig_of(cameras: Mapping[str, CalibrationResult], options: ExportOptions, sev
             f"camera frame {optical_names[0]!r}: found for several cameras, expected {CAMERA} in it"
         )
     return Rig(cameras, frames, options, several)
+
+
+def _listed(frames: Sequence[str]) -> str:
+    return ", ".join(frames[:12]) + (", ..." if len(frames) > 12 else "")
 
 
 def filled(frame: str, name: str, number: int) -> str:

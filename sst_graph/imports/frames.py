@@ -54,7 +54,8 @@ class ImportOptions:
         camera_link: name of the camera's link (x forward, y left, z up), where the file has no optical frame.
         lidar_frame: name of the LiDAR's frame.
         parent: frame in the place of the IMU, of a chain of cameras on an IMU; None: the LiDAR itself.
-        tree: further transforms, such as that of the LiDAR in ``parent``.
+        tree: further transforms, such as that of the LiDAR in ``parent``; the file's replace those of the
+            same child.
     """
 
     camera: str | None = None

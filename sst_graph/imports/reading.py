@@ -20,6 +20,7 @@ from sst_graph.result import file_of_one_camera
 from sst_graph.types import ByValue
 
 _DEFAULT_CAMERA = "image_2"
+_RIG = "a rig of several cameras"
 _KITTI_LINE = re.compile(r"^(P\d|Tr):\s", re.MULTILINE)
 _PYTHON_LINE = re.compile(r"^[ \t]*(from|import) launch|^def generate_launch_description", re.MULTILINE)
 
@@ -87,9 +88,12 @@ def read_tree(path: Path) -> Transforms:
         MissingDependencyError: a YAML file, and PyYAML is not installed.
     """
     document = read_document(path, TREE)
+    expected = f"a tree of transforms: one of {', '.join(_TREES)}"
+    if _is_rig(document):
+        raise DataError(path, _RIG, expected)
     form = recognized(document)
     if form not in _TREES:
-        raise DataError(path, f"a file of the format {form}", f"one of {', '.join(_TREES)}")
+        raise DataError(path, f"a file of the format {form}", expected)
     return _TREES[form](document)
 
 
@@ -128,9 +132,9 @@ def _of_text(document: Document, start: str) -> set[str]:
         value = document.json
         if isinstance(value, dict):
             marginal = value.get("format") == MARGINAL_FORMAT
-            if value.get("format") == "sst-graph/rig":
+            if _is_rig(document):
                 expected = "the calibration.json of one (calibrate --init takes the folder of a rig)"
-                raise DataError(document.path, "a rig of several cameras", expected)
+                raise DataError(document.path, _RIG, expected)
             own = "T_camera_lidar" in value or value.get("format") == records.VEHICLE_FORMAT
             return {"gtsam"} if marginal else {"calibration"} if own else set()
         return {"nuscenes"} if records.is_nuscenes(value) else set()
@@ -144,6 +148,12 @@ def _of_text(document: Document, start: str) -> set[str]:
         return set()
     kinds = (("ros-tf", tables.is_message), ("autoware", tables.is_sensor_kit), ("opencv", records.is_opencv))
     return chains.dialects(table) | {name for name, matches in kinds if matches(table)}
+
+
+def _is_rig(document: Document) -> bool:
+    """Whether it is the result of a rig, a rig.json."""
+    value = document.json if document.text.lstrip()[:1] == "{" else None
+    return isinstance(value, dict) and value.get("format") == "sst-graph/rig"
 
 
 def _of_xml(document: Document) -> set[str]:
@@ -178,9 +188,11 @@ def _by(read: Callable[[Document, ImportOptions], Found]) -> _Reader:
 def _of_frames(document: Document, options: ImportOptions, form: str) -> ImportedCalibration:
     """Of a format that holds named frames, and a time offset in a comment at best."""
     transforms = _TREES[form](document)
-    if options.tree is not None:
-        transforms = transforms.joined(options.tree)
-    cTl, camera, lidar = extrinsic_between(transforms, options, document.path)
+    tree = Transforms() if options.tree is None else options.tree.beside(transforms)
+    cTl, camera, lidar = extrinsic_between(transforms.joined(tree), options, document.path)
+    if tree.connected(camera, lidar):
+        found = f"{camera!r} and {lidar!r} joined by --tree alone"
+        raise DataError(document.path, found, "a transform of the file between them")
     time_offset_s = stated_time_offset_s(document.text, camera, document.path)
     return ImportedCalibration(cTl, time_offset_s, form, f"{lidar} in {camera}")
 

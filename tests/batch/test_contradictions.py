@@ -231,6 +231,7 @@ def test_the_offset_of_every_drive_counts() -> None:
         assert offsets["standing"] > 3.0 * CONFIG.observability.time_offset_s > offsets["moving"]
 
 
+@pytest.mark.slow
 def test_parts_have_the_tracks_of_their_scans() -> None:
     drives = prepared()
     parts, scans = parts_of(drives), (3, 4, 5, 6, 10, 11)
@@ -329,6 +330,7 @@ def test_motion_is_left_out_where_what_misleads_it_is_estimated() -> None:
         assert (found.estimate is labels) is not used
 
 
+@pytest.mark.slow
 def test_motion_that_does_not_fit_itself_contradicts_nothing() -> None:
     (drive,) = prepared()
     chi2s = []

@@ -70,6 +70,7 @@ def result():  # type: ignore[no-untyped-def]
     return calibrate(unlabelled(), unlabelled().truth.cTl.retract(AWAY))  # type: ignore[union-attr]
 
 
+@pytest.mark.slow
 def test_around_the_inverse_of_an_upright_start_nothing_is_searched() -> None:
     nominal, no_drive = unlabelled().nominal, cast(Drive, None)
     assert nominal is not None

@@ -48,7 +48,13 @@ def _one_ring(scan: Scan, rng: Rng) -> Scan:
     return replace(scan, rings=np.zeros(len(scan.points), np.uint16))
 
 
-@pytest.mark.parametrize("cloud", [_sphere, _one_place, _first(1), _first(10), _one_ring])
+@pytest.mark.parametrize(
+    "cloud",
+    [
+        *(_one_place, _first(1), _first(10)),
+        *(pytest.param(cloud, marks=pytest.mark.slow) for cloud in (_sphere, _one_ring)),
+    ],
+)
 @pytest.mark.parametrize("method", ["joint", "edges"])
 def test_clouds_without_structure(
     cloud: Callable[[Scan, Rng], Scan], method: Any, capfd: pytest.CaptureFixture[str]

@@ -86,6 +86,7 @@ def test_little_of_a_frame_stays_in_memory() -> None:
     assert (many_peak - few_peak) / 12 < 100_000
 
 
+@pytest.mark.slow
 def test_little_of_a_frame_by_edges_stays_in_memory() -> None:
     """Its boundary points alone take 0.3 MB."""
     few, few_peak, _ = traced(6, UNLABELLED)

@@ -136,6 +136,33 @@ def test_into_the_tree_of_a_vehicle(
     assert "found no frame 'lidar' among base_link, velodyne" in capsys.readouterr().err
 
 
+ROOFED = """<robot name="v">
+<joint name="a" type="fixed"><parent link="base_link"/><child link="roof"/></joint>
+<joint name="b" type="fixed"><parent link="roof"/><child link="velodyne"/></joint>
+<joint name="c" type="fixed"><parent link="base_link"/><child link="imu"/></joint>
+<joint name="d" type="fixed"><parent link="roof"/><child link="camera_link"/></joint></robot>"""
+
+
+@pytest.mark.parametrize("form", ["ros-tf", "ros1-launch", "ros2-launch", "ros2-launch-xml", "urdf", "xacro"])
+def test_a_joint_of_the_vehicle_that_is_replaced_is_named(
+    result_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str
+) -> None:
+    (tmp_path / "robot.urdf").write_text(ROOFED)
+    command = ["export", str(result_file), "--to", form, "--tree", str(tmp_path / "robot.urdf")]
+    command += ["--lidar-frame", "velodyne", "--parent"]
+    assert main([*command, "camera_link", "--child", "roof"]) == 0
+    assert capsys.readouterr().err == (
+        "sst-graph: warning: roof has a parent in the tree already, base_link: the file replaces that joint, "
+        "which cuts base_link, imu off from roof\n"
+    )
+    assert main([*command, "camera_link", "--child", "velodyne"]) == 0
+    assert "velodyne has a parent in the tree already, roof" in capsys.readouterr().err
+    # The root has no parent, and the camera's own place is what is calibrated.
+    for ends in (["camera_link", "--child", "base_link"], ["roof", "--child", "camera_link"]):
+        assert main([*command, *ends]) == 0
+        assert capsys.readouterr().err == ""
+
+
 def test_a_rig_by_its_folder_and_by_its_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rig = rig_of(marginal_of(2))
     for name, result in rig.cameras.items():

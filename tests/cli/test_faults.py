@@ -28,6 +28,11 @@ from checks.fault_matrix import (
 )
 from sst_graph.cli.progress import PREFIX
 
+ALSO_WRITING = (
+    *("calibrate", "calibrate, two cameras", "calibrate --video", "demo", "track", "track --view-save"),
+    *("export --to gtsam", "overlay --video", "import", "segment", "view", "batch"),
+    *("experiment fit", "experiment basin", "experiment table1"),
+)
 SIGNAL_AT_IMPORT = """
 import os, signal, sys
 number, module, sys.argv = int(sys.argv[1]), sys.argv[2], ["sst-graph", *sys.argv[3:]]
@@ -126,7 +131,10 @@ def test_a_killed_tracker_resumes_to_the_same_bytes(bench: Bench) -> None:
     assert row.finished >= 1
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize(
+    "number",
+    [signal.SIGINT, *(pytest.param(n, marks=pytest.mark.slow) for n in (signal.SIGTERM, signal.SIGHUP))],
+)
 def test_a_signal_leaves_no_unfinished_output(bench: Bench, number: int) -> None:
     _holds(ended_by(bench, COMMANDS["simulate"], number, [0.85]))
 
@@ -167,12 +175,7 @@ def test_a_full_disk_is_named_and_leaves_nothing(bench: Bench, command: str) -> 
 
 
 @pytest.mark.parametrize(
-    "command",
-    [
-        *("simulate", "calibrate", "calibrate, two cameras", "calibrate --video", "demo"),
-        *("track", "track --view-save", "export", "export --to gtsam", "overlay --video", "import"),
-        *("segment", "view", "batch", "experiment fit", "experiment basin", "experiment table1"),
-    ],
+    "command", ["simulate", "export", *(pytest.param(name, marks=pytest.mark.slow) for name in ALSO_WRITING)]
 )
 def test_a_place_that_cannot_be_written_is_refused_before_the_work(bench: Bench, command: str) -> None:
     _holds(read_only(bench, COMMANDS[command]))
@@ -203,6 +206,7 @@ def test_a_full_stdout_does_not_change_what_a_calibration_is_worth(bench: Bench)
         assert (desk / "out" / "calibration.json").is_file()
 
 
+@pytest.mark.slow
 def test_closed_streams_do_not_become_files(bench: Bench) -> None:
     desk = bench.desk()
     command = [sys.executable, "-m", "sst_graph", *bench.arguments(COMMANDS["export"], desk)]

@@ -232,6 +232,7 @@ def test_a_folder_whose_name_is_not_utf8_is_no_obstacle(
     assert read_result(out / "calibration.json").frames_used[0].drive == "stra\\xdfe/00"
 
 
+@pytest.mark.slow
 def test_notes_beside_a_result_survive(street: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = ["calibrate", str(street), "--out", str(out), *PARSED]

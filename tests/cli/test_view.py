@@ -60,18 +60,20 @@ def test_nothing_of_another_kind_is_replaced(
     assert "another kind of file, expected a recording of rerun" in captured.err
 
 
-def test_without_the_extra_the_message_names_it(street: Path, result: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("command", ["view", pytest.param("track", marks=pytest.mark.slow)])
+def test_without_the_extra_the_message_names_it(
+    street: Path, result: Path, tmp_path: Path, command: str
+) -> None:
     (tmp_path / "rerun.py").write_text("raise ImportError('not here')")
-    path = os.pathsep.join([str(tmp_path), *sys.path])
-    for command in (["view", result, street], ["track", street, "--view"]):
-        done = subprocess.run(
-            [sys.executable, "-m", "sst_graph", *command],
-            env={**os.environ, "PYTHONPATH": path},
-            capture_output=True,
-            text=True,
-        )
-        assert done.returncode == 2 and done.stdout == ""
-        assert done.stderr.count("\n") == 1 and "pip install 'sst-graph[rerun]'" in done.stderr
+    arguments = {"view": ["view", result, street], "track": ["track", street, "--view"]}[command]
+    done = subprocess.run(
+        [sys.executable, "-m", "sst_graph", *arguments],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 2 and done.stdout == ""
+    assert done.stderr.count("\n") == 1 and "pip install 'sst-graph[rerun]'" in done.stderr
 
 
 @pytest.mark.parametrize("most_bytes", [3000, 60_000])

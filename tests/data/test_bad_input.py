@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from layouts import as_folder, as_kitti_raw
 
 from sst_graph.data import Loader, loader_names, open_source, register_loader
 from sst_graph.drive.input_statistics import image_statistics
@@ -167,6 +168,17 @@ def test_bad_point_times_are_refused(drive: Path, values: np.ndarray, message: s
     (drive / "velodyne_times/000001.bin").unlink()
     with pytest.raises(DataError, match="velodyne_times: found no file for frame 1"):
         open_source(drive)
+
+
+@pytest.mark.parametrize("layout", ["KITTI", "KITTI raw", "folder"])
+def test_a_cloud_without_points_is_named_and_not_its_labels(layout: str, drive: Path, tmp_path: Path) -> None:
+    if layout != "KITTI":
+        drive = (as_folder if layout == "folder" else as_kitti_raw)(drive, tmp_path / "other")
+    clouds = sorted(path for path in drive.rglob("*.bin") if "velodyne_times" not in path.parts)
+    clouds[2].write_bytes(b"")
+    expected = rf"{clouds[2].name}: found no point, expected {POINTS}, as many as .*\.label has labels"
+    with pytest.raises(DataError, match=expected):
+        read_all(drive)
 
 
 def test_two_files_of_one_number_are_refused(drive: Path) -> None:

@@ -112,6 +112,7 @@ def _prepared(source: Source) -> Drive:
     return Drive("a", source.camera, frames, (), (), (), statistics=statistics.statistics())
 
 
+@pytest.mark.slow
 def test_clouds_in_other_axes_are_told_by_where_their_rings_stand_out() -> None:
     drive, pose = simulated(STREET), parse_lidar_pose(POSE)
     found = other_axes([_prepared(_InVehicleAxes(drive, pose))])

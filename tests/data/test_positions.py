@@ -37,7 +37,10 @@ SLICED = {"KITTI", "KITTI raw", "folder", "nuScenes", "a slice", "kept", "in oth
 WRONG = [1.0, np.float64(1.0), "1", b"1", None, True, np.True_, [1], (0, 1), np.array([1]), object(), 1j]
 
 
-@pytest.mark.parametrize("kind", MAKE)
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param(kind, marks=pytest.mark.slow if kind == "simulated" else ()) for kind in MAKE],
+)
 def test_a_position_is_a_whole_number_of_a_frame(kind: str, kitti_drive: Path, tmp_path: Path) -> None:
     source = MAKE[kind](kitti_drive, tmp_path)
     count = len(source)

@@ -89,6 +89,7 @@ def test_the_grid_of_a_search_everywhere_repeats_no_rotation_beyond_half_a_turn(
     assert len(rotations) == pytest.approx(4.0 / 3.0 * np.pi * 36.0**3, rel=0.01)
 
 
+@pytest.mark.slow
 def test_the_command_resumes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     small = ["--set", "street.frames=2", "--set", "starts=[1]", "--set", "searches_deg=[30]"]
     small += ["--set", "searches_m=[0.6]", "--set", "street.motion=standing"]

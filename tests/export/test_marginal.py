@@ -282,6 +282,7 @@ def test_a_stored_marginal_follows_the_second_drive() -> None:
     assert 1e-3 < distances[0] < 0.03 and distances[-1] < 1e-3
 
 
+@pytest.mark.slow
 def test_real_matches_of_two_simulated_drives() -> None:
     graphs = [_matched(number) for number in range(2)]
     joint = _batch(graphs)

@@ -88,6 +88,7 @@ def test_kills_and_crashes_are_counted_apart(faults: Path, tmp_path: Path) -> No
     assert "SIGSEGV" in record.reason
 
 
+@pytest.mark.slow
 def test_a_result_that_cannot_be_written_is_no_fault_of_the_data(
     kitti_drive: Path, faults: Path, tmp_path: Path
 ) -> None:

@@ -95,6 +95,7 @@ def test_noise_is_no_turning() -> None:
     assert min(np.sqrt(s.covariance[6, 6]) for s in found) > 0.03
 
 
+@pytest.mark.slow
 def test_noise_that_the_odometry_does_not_know_of_tells_no_roll() -> None:
     """On a straight road a LiDAR that sees itself swerve, and the camera does not, tells no roll."""
     shares = []

@@ -235,8 +235,17 @@ def test_a_format_by_name(tmp_path: Path) -> None:
 
 def test_a_vehicle_that_is_none(tmp_path: Path) -> None:
     path = written(tmp_path, "P2: 700 0 600 0 0 700 180 0 0 0 1 0")
-    with pytest.raises(DataError, match="a file of the format kitti, expected one of ros-tf, ros1-launch"):
+    with pytest.raises(
+        DataError, match="a file of the format kitti, expected a tree of transforms: one of ros-tf"
+    ):
         read_tree(path)
+    path = written(tmp_path, '{"format": "sst-graph/rig", "version": 1}')
+    with pytest.raises(
+        DataError, match="found a rig of several cameras, expected a tree of transforms: one of"
+    ):
+        read_tree(path)
+    with pytest.raises(DataError, match=r"a rig of several cameras, expected the calibration\.json of one"):
+        import_calibration(path)
 
 
 def test_a_loop_of_frames_ends(tmp_path: Path) -> None:

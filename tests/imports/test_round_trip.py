@@ -73,6 +73,37 @@ def test_on_a_vehicle(target: str, tmp_path: Path) -> None:
     assert agrees(written(tmp_path, text), turned(4), options) == target
 
 
+@pytest.mark.parametrize("target", ["urdf", "ros-tf"])
+@pytest.mark.parametrize(
+    ("parent", "child"),
+    [
+        ("base_link", "camera_link"),
+        ("camera_link", "base_link"),
+        ("camera_link", "roof"),
+        ("camera_link", "lidar"),
+    ],
+)
+def test_the_file_replaces_the_camera_of_the_tree(
+    target: str, parent: str, child: str, tmp_path: Path
+) -> None:
+    """The tree has the camera on the roof already, somewhere else."""
+    tree = read_tree(vehicle(tmp_path))
+    options = ExportOptions(parent=parent, child=child, tree=tree)
+    path = written(tmp_path, export_text(turned(4), target, options))
+    found = import_calibration(path, ImportOptions(tree=tree))
+    assert found.cTl.equals(turned(4).T_camera_lidar, 1e-12)
+
+
+def test_a_tree_that_joins_camera_and_lidar_by_itself_is_refused(tmp_path: Path) -> None:
+    """Its pose is none of the file's: the file has another camera."""
+    tree = read_tree(vehicle(tmp_path))
+    other = ExportOptions("rear_optical_frame", parent="base_link", tree=tree)
+    path = written(tmp_path, export_text(turned(4), "urdf", other))
+    expected = "found 'camera_link' and 'lidar' joined by --tree alone, expected a transform of the file"
+    with pytest.raises(DataError, match=expected):
+        import_calibration(path, ImportOptions(camera_link="camera_link", tree=tree))
+
+
 @pytest.mark.parametrize("target", ["kalibr", "openvins"])
 def test_chains_on_the_imu_of_a_vehicle(target: str, tmp_path: Path) -> None:
     tree = read_tree(vehicle(tmp_path))

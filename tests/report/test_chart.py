@@ -143,6 +143,7 @@ def _printed(**variables: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_matplotlib_is_imported_by_the_first_chart_and_bytes_are_the_same_in_another_process(
     tmp_path: Path,
 ) -> None:

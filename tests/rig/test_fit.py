@@ -89,6 +89,7 @@ def misfit_px(result: CalibrationResult, name: str, at: Calibration) -> float:
     return float(np.ptp(points.residuals_px - ((uvs - points.pixels) * points.normals).sum(axis=1)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_with_nothing_known_the_fit_is_that_of_the_camera_by_itself(name: str) -> None:
     result = solved()[name]

@@ -89,6 +89,7 @@ class Counting:
         return self.source.read_image(position)
 
 
+@pytest.mark.slow
 def test_the_images_of_a_further_camera_are_read_and_not_its_scans() -> None:
     few = replace(STREET, frames=6)
     drive = simulate(few)

@@ -441,6 +441,7 @@ def test_a_frame_with_another_parent_is_warned_of(bag: Any, config: TrackerConfi
     assert "tf" not in _diagnostics(silent, EPOCH_NS)
 
 
+@pytest.mark.slow
 def test_a_bag_that_begins_again(bag: Any, config: TrackerConfig) -> None:
     """The end of the first play is used before the second, in which the order is that of the stamps again."""
     messages = _messages(bag)

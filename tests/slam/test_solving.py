@@ -147,6 +147,7 @@ def test_the_end_begins_with_a_wide_kernel_again(street: Street) -> None:
     assert terms.converge().converged and terms.converge(1).converged
 
 
+@pytest.mark.slow
 def test_a_solver_that_does_not_relinearize_is_named(street: Street) -> None:
     """gtsam's own defaults leave an extrinsic that is less than 0.1 rad off where it began."""
     found = street.frame_by_frame(gtsam.ISAM2(), street.start(1))

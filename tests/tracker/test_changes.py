@@ -305,6 +305,7 @@ def test_a_knock_that_no_frame_can_show_is_not_ok(
     assert "no frame would have shown" in tracker.result().reasons[0]
 
 
+@pytest.mark.slow
 def test_frames_that_show_nothing_let_the_estimate_age(
     street: SimulatedDrive, frames: list[Frame], tmp_path: Path
 ) -> None:
@@ -447,6 +448,7 @@ def test_labels_of_most_objects_that_are_missing_are_no_change(
     assert "are missing" in lines[-1].suspected_change and lines[-1].status != "ok"
 
 
+@pytest.mark.slow
 def test_a_scan_without_match_is_not_compared_again_when_its_turn_comes(
     street: SimulatedDrive, frames: list[Frame]
 ) -> None:

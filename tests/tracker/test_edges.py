@@ -275,6 +275,7 @@ def test_a_checkpoint_before_the_start_goes_on_alike(tmp_path: Path) -> None:
         np.testing.assert_array_equal(gradients.strengths, stored_gradients.strengths)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_with_a_review_under_way(tmp_path: Path) -> None:
     """The tracker that is read back does the work of it again: both are at the same step."""
     tracker = begun("edges", 0)

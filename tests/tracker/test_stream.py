@@ -97,6 +97,7 @@ def test_a_result_names_frames_by_their_numbers_in_the_drive(
             wrong()
 
 
+@pytest.mark.slow
 def test_what_leaves_the_window_still_counts(street: SimulatedDrive, frames: list[Frame]) -> None:
     whole, short = (
         tracker_from_truth(street),

@@ -103,6 +103,7 @@ def test_no_line_of_track_is_ok_where_the_sweep_is_open(
         assert not any(line["status"] == "ok" for line in lines)
 
 
+@pytest.mark.slow
 def test_no_line_is_ok_where_the_scans_contradict_what_was_said_of_them() -> None:
     drive = simulated(SLOW)
     found = replace(OPEN, kind="clockwise", timing=BOTH[0], others=())

@@ -11,6 +11,7 @@ from sst_graph.cli.output_places import check_apart
 from sst_graph.data.kitti.calib import read_calibration
 from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.export import ExportOptions, export_text
+from sst_graph.export.formats import replaced_joints
 from sst_graph.export.text import heading
 from sst_graph.files import output_file
 from sst_graph.imports import read_tree
@@ -60,6 +61,8 @@ def _text(args: argparse.Namespace) -> str:
         text = export_text(result, args.to, options)
     except EstimationError as error:
         raise EstimationError(f"{_file(args.result)}: {error}") from error
+    for replaced in replaced_joints(result, args.to, options):
+        complain(f"warning: {replaced}")
     if result.status != "ok":
         reasons = " ".join("; ".join(_reasons(result)).split())
         complain(f"warning: {result.status}, exported all the same" + (f": {reasons}" if reasons else ""))

@@ -94,7 +94,7 @@ class CloudFiles:
         path = self.labels.get(k)
         if path is None and (labels := cloud.labels()) is not None:
             return classes_of_points(labels[used], cloud.path)
-        return point_labels(path, used)
+        return point_labels(path, used, cloud.path)
 
 
 def open_folder(path: Path, options: SourceOptions) -> Source:

@@ -109,7 +109,7 @@ class KittiSource(IndexedSource):
         points, intensities = read_points(path)
         # Beams without a return come as NaN from many drivers.
         used: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
-        classes, instances = point_labels(self.files.labels.get(index), used)
+        classes, instances = point_labels(self.files.labels.get(index), used, path)
         offsets_s = self._offsets(index, points, used)
         points = np.ascontiguousarray(points[used])
         scan = Scan(

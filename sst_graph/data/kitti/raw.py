@@ -97,7 +97,7 @@ class RawScans:
         read = read_points if path.suffix.lower() == ".bin" else read_text_points
         points, intensities = read(path)
         used: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
-        classes, instances = point_labels(self.labels.get(number), used)
+        classes, instances = point_labels(self.labels.get(number), used, path)
         points = np.ascontiguousarray(points[used])
         offsets_s = None if self.turn is None else self.turn.offsets_s(number, stamp_ns, points)
         left_out = len(used) - len(points)

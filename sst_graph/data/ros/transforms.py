@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Collection
 from itertools import pairwise
 from typing import Any
 
@@ -48,6 +49,23 @@ class Transforms:
             both._wrong |= one._wrong
         return both
 
+    def beside(self, other: Transforms) -> Transforms:
+        """What is left of these where another file's take their place.
+
+        A frame that has a pose there has none here. Where its parent there is below it here, the parent has
+        no pose here either: it would be above and below at once.
+        """
+        kept = self._without({child for _, child in other._poses})
+        for parent, child in other._poses:
+            if kept.connected(parent, child):
+                kept = kept._without({parent})
+        return kept
+
+    def connected(self, one: str, other: str) -> bool:
+        """Whether a chain of transforms joins two frames."""
+        known = self.frames
+        return one in known and other in known and self._path(one, other) is not None
+
     @property
     def frames(self) -> list[str]:
         """Names of all frames, each once, in the order in which they came."""
@@ -85,6 +103,14 @@ class Transforms:
             step = self._poses[edge]
             pose = pose * (step if edge == (first, second) else step.inverse())
         return pose, f"by transforms {' - '.join(path)}"
+
+    def _without(self, children: Collection[str]) -> Transforms:
+        """These but for the poses of some frames."""
+        kept = Transforms()
+        kept._poses = {edge: pose for edge, pose in self._poses.items() if edge[1] not in children}
+        kept._moving = {edge for edge in self._moving if edge in kept._poses}
+        kept._wrong = {edge: wrong for edge, wrong in self._wrong.items() if edge in kept._poses}
+        return kept
 
     def _path(self, start: str, end: str) -> list[str] | None:
         """The shortest chain of frames."""

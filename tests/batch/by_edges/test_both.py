@@ -86,6 +86,7 @@ def parts() -> tuple[Drive, Drive]:
     return by_labels, by_edges
 
 
+@pytest.mark.slow
 def test_labels_and_edges_are_of_different_pairs() -> None:
     by_labels, by_edges = parts()
     state = State(simulated(SMALL).truth.cTl, (simulated(SMALL).truth.time_offset_s,))

@@ -68,6 +68,7 @@ def test_a_kitti_root_gives_the_stretch_of_sequence_00(
     assert len((out.parent / STATE).read_bytes().splitlines()) == 2 * len(state.splitlines()) - 1
 
 
+@pytest.mark.slow
 def test_a_kill_among_the_outputs_needs_no_overwrite(
     kitti: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
