@@ -173,7 +173,8 @@ class LabelStore:
 
     def _has_labels(self, side: Side, model: str) -> bool:
         """Whether the labels of a picture or a scan are stored, whole."""
-        names = (place.name for place in self._place(side, model).iterdir())
+        place = self._place(side, model)
+        names = (file.name for file in place.iterdir()) if place.is_dir() else ()
         suffix = ".png" if side == "images" else ".label"
         return any(name.endswith(suffix) and not name.endswith(_INSTANCES) for name in names)
 
