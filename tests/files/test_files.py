@@ -57,7 +57,7 @@ import sys
 from pathlib import Path
 from sst_graph.errors import ConfigError
 from sst_graph.files.staging import claim
-for _ in range(1000):
+for _ in range(int(sys.argv[2])):
     try:
         claim(Path(sys.argv[1])).release()
     except ConfigError as error:
@@ -371,8 +371,9 @@ def test_a_second_writer_is_refused_before_its_work(tmp_path: Path) -> None:
     assert tree(tmp_path) == {"out/a": "first"}
 
 
-def test_of_many_writers_each_has_the_name_or_is_told_who_has_it(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", CLAIM_OFTEN, str(tmp_path / "a")]
+@pytest.mark.parametrize("rounds", [1000, pytest.param(4000, marks=pytest.mark.slow)])
+def test_of_many_writers_each_has_the_name_or_is_told_who_has_it(tmp_path: Path, rounds: int) -> None:
+    command = [sys.executable, "-c", CLAIM_OFTEN, str(tmp_path / "a"), str(rounds)]
     runs = [subprocess.Popen(command, stderr=subprocess.PIPE, text=True) for _ in range(3)]
     assert [run.communicate(timeout=60)[1] for run in runs] == ["", "", ""]
     assert list(tmp_path.iterdir()) == []
@@ -450,7 +451,8 @@ def test_a_folder_of_many_files_is_swept(tmp_path: Path) -> None:
     assert sorted(tmp_path.iterdir()) == sorted(others)
 
 
-def test_a_sweep_leaves_what_another_is_writing(tmp_path: Path) -> None:
+@pytest.mark.parametrize("rounds", [250, pytest.param(1000, marks=pytest.mark.slow)])
+def test_a_sweep_leaves_what_another_is_writing(tmp_path: Path, rounds: int) -> None:
     """Also in the instants before a file is locked, and before it has its name."""
     over = threading.Event()
 
@@ -461,14 +463,14 @@ def test_a_sweep_leaves_what_another_is_writing(tmp_path: Path) -> None:
     sweeping = threading.Thread(target=sweep)
     sweeping.start()
     try:
-        for number in range(250):
+        for number in range(rounds):
             atomic_write_bytes(tmp_path / "a", str(number).encode())
             for _ in atomic_write_in_steps(tmp_path / "b", lambda stream: iter([stream.write(b"b")])):
                 pass
     finally:
         over.set()
         sweeping.join()
-    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"a": "249", "b": "b"}
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"a": str(rounds - 1), "b": "b"}
 
 
 @pytest.mark.parametrize("size", ["1e999", "Infinity", "1" + "0" * 5000, "null", "[" * 200_000, "fifo"])

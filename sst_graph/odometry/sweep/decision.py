@@ -36,7 +36,7 @@ REMEDY = "say --sweep compensated, clockwise or counterclockwise, or give points
 
 _SAMPLED_PAIRS = 6
 """Pairs of consecutive scans, spread over the drive, that give the speed."""
-_MAX_WINDOWS = 6
+MAX_WINDOWS = 6
 """Most windows that are registered, the fastest first, as long as they may decide."""
 _WINDOW_SCANS = 12
 """Scans of a window."""
@@ -149,6 +149,10 @@ class SweepDecision:
                 f"the scans are not as --sweep {word} says, but {self.sentence}: leave --sweep out, or say "
                 f"--sweep {self.kind}"
             )
+        return self.as_given(contradiction)
+
+    def as_given(self, contradiction: str) -> SweepDecision:
+        """That times are given, which hold, and how the scans contradict them, or nothing."""
         return replace(self, kind="given", timing=AT_ONCE, others=(), contradiction=contradiction)
 
     def to_dict(self) -> dict[str, Any]:
@@ -190,7 +194,7 @@ def decide_sweep(
     scan_at: Callable[[int], Scan | None],
     count: int,
     stamp: SweepStamp = "forward",
-    max_windows: int = _MAX_WINDOWS,
+    max_windows: int = MAX_WINDOWS,
 ) -> SweepDecision:
     """Decide the sweep from the scans of a drive that have no times of their points.
 

@@ -7,15 +7,17 @@ duration of a turn, and clouds that were compensated and still carry the times o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
+from scipy import ndimage
 
+from sst_graph.odometry.cloud import usable_points
 from sst_graph.odometry.sweep.decision import FRACTIONS, SweepDecision
-from sst_graph.odometry.sweep.window import SECTORS
-from sst_graph.sweep_timing import AT_ONCE
+from sst_graph.odometry.sweep.window import SECTORS, sectors_of
 from sst_graph.types import Scan
 
+_MAX_POINTS = 40_000
+"""Most points of a scan that are read."""
 _ONE_INSTANT_S = 1e-3
 """Points whose times differ by less share one instant [s]."""
 _MIN_POINTS = 5
@@ -42,24 +44,19 @@ def turn_of(scans: Sequence[Scan]) -> float | None:
 
 
 def _turn(scan: Scan) -> float | None:
-    if scan.offsets_s is None:
+    points, _, times_s = usable_points(scan, 0.0, np.inf, _MAX_POINTS)
+    if times_s is None or not len(times_s) or not np.isfinite(times_s).all():
         return None
-    points, times_s = scan.points.astype(np.float64), scan.offsets_s.astype(np.float64)
-    kept = np.isfinite(times_s) & np.isfinite(points).all(axis=1) & (np.abs(points[:, :2]).max(axis=1) > 0.0)
-    if not kept.any():
-        return None
-    azimuths_rad, times_s = np.arctan2(points[kept, 1], points[kept, 0]), times_s[kept]
     if np.ptp(times_s) < _ONE_INSTANT_S:
         return 0.0
-    sectors = np.clip(((azimuths_rad / (2.0 * np.pi) + 0.5) * SECTORS).astype(int), 0, SECTORS - 1)
-    filled = [k for k in range(SECTORS) if np.count_nonzero(sectors == k) >= _MIN_POINTS]
+    sectors = sectors_of(np.arctan2(points[:, 1], points[:, 0]))
+    filled = np.flatnonzero(np.bincount(sectors) >= _MIN_POINTS)
     if len(filled) < _MIN_SECTORS:
         return None
-    medians = np.array([np.median(times_s[sectors == k]) for k in filled])
+    medians = np.asarray(ndimage.median(times_s, sectors, filled))
     # A turn begins where the times jump most from one sector to the next.
-    first = (int(np.argmax(np.abs(np.diff(medians, append=medians[0])))) + 1) % len(filled)
-    medians, shares = np.roll(medians, -first), np.roll(np.array(filled) / SECTORS, -first)
-    shares = shares + np.append(0, np.cumsum(np.diff(shares) < 0.0))
+    last = int(np.argmax(np.abs(np.diff(medians, append=medians[0]))))
+    shares = np.mod(filled - filled[(last + 1) % len(filled)], SECTORS) / SECTORS
     slope, constant = np.polyfit(shares, medians, 1)
     deviation = np.sqrt(np.mean((slope * shares + constant - medians) ** 2))
     return float(slope) if deviation < _MAX_DEVIATION * abs(slope) else None
@@ -82,7 +79,7 @@ def compared_with_times(decision: SweepDecision, turn_s: float) -> SweepDecision
             f"{decision.kind if known else 'another sweep'} ({decision.evidence}): correct the times"
             + f", or say --sweep {decision.kind}, which leaves them out" * known
         )
-    return replace(decision, kind="given", timing=AT_ONCE, others=(), contradiction=contradiction)
+    return decision.as_given(contradiction)
 
 
 def _words(turn_s: float, period_s: float) -> str:

@@ -13,7 +13,7 @@ from sst_graph.data.frame_parts import (
 )
 from sst_graph.data.source_view import SourceView
 from sst_graph.errors import ConfigError
-from sst_graph.odometry.sweep.decision import CLAIMS, SweepDecision, decide_sweep
+from sst_graph.odometry.sweep.decision import CLAIMS, MAX_WINDOWS, SweepDecision, decide_sweep
 from sst_graph.odometry.sweep.given_times import compared_with_times, turn_of
 from sst_graph.sampling import evenly_spread
 from sst_graph.sweep_timing import AT_ONCE, SweepStamp, SweepTiming
@@ -94,7 +94,7 @@ def with_sweep(source: Source, decide: bool = True) -> SweptSource:
         lambda k: _without_times(ahead.look(positions[k])),
         len(positions),
         stamp,
-        **({} if turn_s is None else {"max_windows": _COMPARED_WINDOWS}),
+        MAX_WINDOWS if turn_s is None else _COMPARED_WINDOWS,
     )
     decision = replace(decision, frames=tuple(positions[k] for k in decision.frames))
     if turn_s is not None:

@@ -401,8 +401,13 @@ def _surfaces(points: FloatArray) -> _Surfaces:
     # All towards the sensor: what matches of one surface share is to have one sign.
     normals = normals * -np.sign(np.einsum("ij,ij->i", normals, points))[:, None]
     azimuths = np.arctan2(points[:, 1], points[:, 0])
-    sectors = np.minimum((turned(azimuths, -np.pi) * SECTORS).astype(np.intp), SECTORS - 1)
-    return _Surfaces(points, normals, azimuths, sectors, _of_every_direction(normals, _POINTS_PER_DIRECTION))
+    chosen = _of_every_direction(normals, _POINTS_PER_DIRECTION)
+    return _Surfaces(points, normals, azimuths, sectors_of(azimuths), chosen)
+
+
+def sectors_of(azimuths_rad: FloatArray) -> IndexArray:
+    """Sectors (n,) of azimuth, the first one behind."""
+    return np.minimum((turned(azimuths_rad, -np.pi) * SECTORS).astype(np.intp), SECTORS - 1)
 
 
 def _of_every_direction(normals: FloatArray, most: int) -> IndexArray:
