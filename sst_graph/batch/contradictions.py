@@ -264,12 +264,14 @@ def _step_sentence(parts: PartSolver, step: Step) -> str:
     else:
         where = f"frames {at} to {drive.scans[end - 1].index} and the others"
         what = "they differ"
-    return f"{drive.name}: {where} contradict each other: {what} in {named.sentence}; {_advice(named.kinds)}"
+    return f"{drive.name}: {where} contradict each other: {what} in {named.sentence}; {advice(named.kinds)}"
 
 
-def _advice(kinds: Sequence[str]) -> str:
+def advice(kinds: Sequence[str], by_labels: bool = True) -> str:
+    """What to check where parts of a drive differ in some of rotation, translation and time offset."""
+    turned = ("the mount was moved", "the masks slide")
     causes = {
-        "rotation": ("the mount was moved", "the masks slide"),
+        "rotation": turned if by_labels else turned[:1],
         "translation": ("the mount was moved",),
         "offset": ("an image or a scan was lost", "a clock was set"),
     }

@@ -22,9 +22,10 @@ def preflight(drives: Sequence[Drive], guess: Guess, classes: Sequence[SemanticC
     """
     found = [units.start_unit(guess.cTl), repeats.shared_scans(drives)]
     for drive in drives:
-        found += [cameras.image_size(drive.camera), clocks.stamps(drive), clocks.two_clocks(drive)]
-        found += [clocks.apart(drive, guess.time_offset_s), clocks.point_times(drive)]
-        found += [units.rounding(drive), repeats.repeats(drive)]
+        # Repeated scans make stamps seem to run too slowly: the cause is said first.
+        found += [cameras.image_size(drive.camera), repeats.repeats(drive), clocks.stamps(drive)]
+        found += [clocks.two_clocks(drive), clocks.apart(drive, guess.time_offset_s)]
+        found += [clocks.point_times(drive), units.rounding(drive)]
         if classes:
             found += [labels.ground_points(drive), labels.mask_rows(drive), units.clouds(drive)]
         else:

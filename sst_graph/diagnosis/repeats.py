@@ -22,6 +22,10 @@ of a standing one, whose ranges come in steps; a half of two scans in one cloud.
 _MOST_ROUNDED = 0.001
 """Step of rounded coordinates, as a share of the median range, above which points of two scans may be equal
 by chance: 0.00015 of an HDL-64E; at walking pace 0.003, which are 2 cm, are enough for :data:`_SHARED`."""
+_HELD_SHARE = 0.2
+"""Of the shorter of the motions before and after it that a scan moves at most, to be the one before it once
+more. Without this check such drives are told that their stamps run too slowly, by impossible accelerations. A
+vehicle that stops between two scans and goes on is none; a single failed registration is not enough."""
 _LEAST_SAMPLE = 20
 """Points by which two scans are compared."""
 _MOVED_PX, _MOVED_M = 1.0, 0.05
@@ -57,7 +61,7 @@ def repeats(drive: Drive) -> Finding | None:
                 f"{len(found)} of {total} equal the one before to the last bit where the other sensor moves",
                 f"look at {check}, and leave those frames out",
             )
-    return _earlier_points(drive)
+    return _held_scans(drive) or _earlier_points(drive)
 
 
 def shared_scans(drives: Sequence[Drive]) -> Finding | None:
@@ -76,6 +80,22 @@ def shared_scans(drives: Sequence[Drive]) -> Finding | None:
                 "give each frame once: counted twice it makes the sigmas too small",
             )
     return None
+
+
+def _held_scans(drive: Drive) -> Finding | None:
+    """Scans of one turn again, which differ in single points, by noise or by what was done to them: the LiDAR
+    stands still between two scans, and moves before and after."""
+    motions = drive.lidar_motions
+    lengths = np.array([float(np.linalg.norm(m.aTb.translation())) if m.ok else np.nan for m in motions])
+    around = np.minimum(lengths[:-2], lengths[2:])
+    held = np.count_nonzero((around > _MOVED_M) & (lengths[1:-1] < _HELD_SHARE * around))
+    if held < max(_LEAST, _LEAST_SHARE * len(lengths)):
+        return None
+    return Finding(
+        "scans are repeated (a sensor that is slower than its frames), with other noise",
+        f"{held} of {len(lengths)} are where the one before was, though the LiDAR moves before and after",
+        "look at the LiDAR's driver and its recording, and leave those frames out",
+    )
 
 
 def _earlier_points(drive: Drive) -> Finding | None:

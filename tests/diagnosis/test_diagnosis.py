@@ -311,6 +311,36 @@ def test_no_vehicle_drives_like_that(speeds: np.ndarray, words: str | None) -> N
         assert found is not None and words in found.evidence and "run too slowly" in found.cause
 
 
+@pytest.mark.parametrize(
+    ("steps_m", "named"),
+    [
+        (np.tile([0.0, 1.4], 10), True),  # each scan twice
+        (np.where(np.arange(20) % 5 == 3, 0.01, 0.7), True),  # every fifth
+        (np.where(np.arange(20) == 7, 0.0, 0.7), False),  # one failed registration
+        (np.abs(np.linspace(0.7, -0.7, 20)), False),  # to a stop, and on
+        (np.tile([0.0, 0.03], 10), False),  # noise of a standing vehicle
+        (np.tile([0.5, 0.9], 10), False),  # stamps that jitter
+    ],
+)
+def test_scans_that_stand_still_between_others_are_repeated_ones(steps_m: np.ndarray, named: bool) -> None:
+    """Of one turn, though no point is the same to the last bit."""
+    motion = prepared().lidar_motions[0]
+    motions = tuple(
+        replace(
+            motion,
+            from_ns=k * 100_000_000,
+            to_ns=(k + 1) * 100_000_000,
+            aTb=gtsam.Pose3(gtsam.Rot3(), np.array([step, 0.0, 0.0])),
+            ok=True,
+        )
+        for k, step in enumerate(steps_m)
+    )
+    found = preflight([replace(prepared(), lidar_motions=motions)], Guess(None, 0.0), ())
+    said = [finding.sentence for finding in found]
+    assert any("scans are repeated" in sentence for sentence in said) == named, said
+    assert not named or said[0].startswith("scans are repeated (a sensor that is slower than its frames)")
+
+
 @pytest.mark.parametrize("timeless", [(0,), (3, 4), ()])
 def test_scans_without_times_among_scans_with_times(timeless: tuple[int, ...]) -> None:
     """Whether they lack the field, or all of its values are 0."""

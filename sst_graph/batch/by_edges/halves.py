@@ -4,6 +4,10 @@ The stretches of labels (:mod:`sst_graph.batch.contradictions`) are compared by 
 which say too little of soft ones; that of the whole estimate, by half-samples of its objects, is used here. A
 half of the scans is known with twice that variance at most, for what all objects have in common does not
 differ between halves.
+
+What is known of the time offset beside the edges is of the whole drive. Where an image was lost or came late
+in the middle, that holds for one half only, so each half is also solved with it moved by a period of the
+images.
 """
 
 from __future__ import annotations
@@ -18,7 +22,7 @@ from sst_graph.batch.by_edges.parts import thinned
 from sst_graph.batch.by_edges.problem import POINTS_A_SCAN
 from sst_graph.batch.by_edges.reasons import MIN_OVER_OTHER
 from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX
-from sst_graph.batch.contradictions import FALSE_ALARM
+from sst_graph.batch.contradictions import FALSE_ALARM, advice
 from sst_graph.covariance.contradiction import Difference, PartEstimate, name_step
 from sst_graph.edges.agreement import score
 from sst_graph.edges.search import SearchRegion, edge_starts_steps
@@ -36,6 +40,9 @@ _SEARCHED_SCANS = 12
 """Scans of a half on which starts are compared."""
 _HALF_DEG = 5.0
 """A half's own pose is searched within this of the estimate, about each of the camera's axes [deg]."""
+_LATE_IMAGES = (-1, 1)
+"""Periods of the images by which the time offset of a half may differ. Without them, images that are late by
+one in half of a drive give a half that is turned by degrees, or no contradiction at all."""
 _KERNELS_PX = (*START_KERNELS_PX, 2.0, 1.5, 1.2)
 """Scales of the kernel of a half's solution [px]: from a start that is a degree off."""
 
@@ -58,11 +65,11 @@ def halves_reasons(problem: JointProblem, state: State, covariance: FloatArray) 
         found = Difference.of(first, second)
         if found.p_value * len(problem.drives) < FALSE_ALARM:
             at = drive.scans[halves[1][0]].index
+            named = name_step(found, state.cTl)
             reasons.append(
                 f"{drive.name}: frames {drive.scans[0].index} to {drive.scans[halves[0][-1]].index} and "
-                f"those from {at} on contradict each other: the later ones differ in "
-                f"{name_step(found, state.cTl).sentence}; check whether the mount was moved or a clock "
-                "was set, and calibrate the frames before and after apart"
+                f"those from {at} on contradict each other: the later ones differ in {named.sentence}; "
+                f"{advice(named.kinds, by_labels=False)}"
             )
     return tuple(reasons)
 
@@ -83,21 +90,40 @@ def _half(
     # 1. Every start on a few scans.
     region = SearchRegion(state.cTl, state.time_offsets_s[:1], (_HALF_DEG,) * 3)
     searched = run_to_end(edge_starts_steps(edges[0], region))
-    starts = [state, *(replace(state, cTl=start.cTl) for start in searched)]
-    found: list[tuple[float, State]] = []
-    for start in starts:
+    trials = [(0.0, state), *((0.0, replace(state, cTl=start.cTl)) for start in searched)]
+    late_s = [images * drive.image_period_s for images in _LATE_IMAGES]
+    trials += [(shift_s, _later(state, shift_s)) for shift_s in late_s]
+    found: list[tuple[float, float, State]] = []
+    for shift_s, start in trials:
         try:
-            own = solve_joint(some, start, _KERNELS_PX).state
+            own = solve_joint(_with_later_offset(some, shift_s), start, _KERNELS_PX).state
         except EstimationError:
             continue
         # From another start a pose must agree clearly better, as between the optima of a whole drive.
-        found.append((score(edges, own, SCORE_PX) * (1.0 if start is state else 1.0 / MIN_OVER_OTHER), own))
+        share = 1.0 if start is state else 1.0 / MIN_OVER_OTHER
+        found.append((score(edges, own, SCORE_PX) * share, shift_s, own))
     if not found:
         return None
     # 2. The best of them on all.
-    best = max(found, key=lambda one: one[0])[1]
+    _, shift_s, best = max(found, key=lambda one: one[0])
+    half = _with_later_offset(replace(problem, drives=[drive], motions=[motion]), shift_s)
     try:
-        best = solve_joint(replace(problem, drives=[drive], motions=[motion]), best, NEAR_KERNELS_PX).state
+        best = solve_joint(half, best, NEAR_KERNELS_PX).state
     except EstimationError:
         return None
     return PartEstimate(difference(state, best), 2.0 * covariance, float(SAMPLES))
+
+
+def _later(state: State, shift_s: float) -> State:
+    """The state with its time offset moved."""
+    return replace(state, time_offsets_s=tuple(offset_s + shift_s for offset_s in state.time_offsets_s))
+
+
+def _with_later_offset(problem: JointProblem, shift_s: float) -> JointProblem:
+    """The problem with all that is known of the time offset beside the edges moved."""
+    centre, prior = problem.centre, problem.prior
+    return replace(
+        problem,
+        centre=None if centre is None else _later(centre, shift_s),
+        prior=None if prior is None else replace(prior, state=_later(prior.state, shift_s)),
+    )

@@ -20,7 +20,14 @@ from sst_graph.batch.by_edges.optimum import (
     starts_steps,
 )
 from sst_graph.batch.by_edges.problem import LabelEstimate, checking_motion, edges_problem, motion_alone
-from sst_graph.batch.by_edges.reasons import EdgeContrast, edge_contrast, edges_reasons, with_lens_reasons
+from sst_graph.batch.by_edges.reasons import (
+    EdgeContrast,
+    contrast_reasons,
+    edge_contrast,
+    edges_reasons,
+    motion_reasons,
+    with_lens_reasons,
+)
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import MethodEstimate, frames_used
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate, MatchedDrives
@@ -78,6 +85,7 @@ def edges_method(
     )
     checking = checking_motion(motion, config)
     reasons = edges_reasons(solution, contrast, checking, covariance, problem.centre)
+    of_pose = (*contrast_reasons(contrast), *motion_reasons(solution.state, checking, covariance))
     reasons += unsettled
     if config.check_contradictions:
         all_points = replace(problem.whole, drives=calibration.drives)
@@ -91,7 +99,7 @@ def edges_method(
         time_offset_s=solution.state.time_offsets_s[0],
         covariance=covariance,
         frames=frames_used(drives, solution),
-        reasons=(*with_lens_reasons(reasons, lens_reasons, contrast), *own.reasons),
+        reasons=(*with_lens_reasons(reasons, lens_reasons, of_pose), *own.reasons),
         remarks=remarks,
         by_static_objects=covariance,
         diagnostics={

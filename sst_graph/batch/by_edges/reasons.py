@@ -121,26 +121,41 @@ def edges_reasons(
     if not solution.converged:
         reasons.append(still_moved(solution.outer_iterations))
     reasons += contrast_reasons(contrast)
-    if motion is not None:
-        step = difference(motion.state, solution.state)[[0, 1, 2, 6]]
-        floor = _FLOOR if motion.misfit is None else _FLOOR_OF_MISFIT
-        total = (motion.covariance + covariance)[np.ix_([0, 1, 2, 6], [0, 1, 2, 6])] + np.diag(floor**2)
-        chi2 = float(step @ np.linalg.solve(total, step))
-        if chi2 > MAX_MOTION_CHI2:
-            why = "" if motion.misfit is None else f" ({motion.misfit})"
-            reasons.append(
-                f"motion alone gives another calibration, {np.degrees(np.linalg.norm(step[:3])):.2f} deg and "
-                f"{1e3 * step[3]:+.1f} ms away (chi-squared {chi2:.0f} of 4){why}"
-            )
+    reasons += motion_reasons(solution.state, motion, covariance)
     return (*reasons, *far_reasons(solution.state.cTl, centre.cTl))
 
 
+def motion_reasons(state: State, motion: MotionSolution | None, covariance: FloatArray) -> list[str]:
+    """Why an estimate may be wrong that motion contradicts.
+
+    Args:
+        covariance: (7, 7) of the estimate.
+    """
+    if motion is None:
+        return []
+    step = difference(motion.state, state)[[0, 1, 2, 6]]
+    floor = _FLOOR if motion.misfit is None else _FLOOR_OF_MISFIT
+    total = (motion.covariance + covariance)[np.ix_([0, 1, 2, 6], [0, 1, 2, 6])] + np.diag(floor**2)
+    chi2 = float(step @ np.linalg.solve(total, step))
+    if chi2 <= MAX_MOTION_CHI2:
+        return []
+    why = "" if motion.misfit is None else f" ({motion.misfit})"
+    return [
+        f"motion alone gives another calibration, {np.degrees(np.linalg.norm(step[:3])):.2f} deg and "
+        f"{1e3 * step[3]:+.1f} ms away (chi-squared {chi2:.0f} of 4){why}"
+    ]
+
+
 def with_lens_reasons(
-    reasons: Sequence[str], of_lens: Sequence[str], contrast: EdgeContrast
+    reasons: Sequence[str], of_lens: Sequence[str], of_pose: Sequence[str]
 ) -> tuple[str, ...]:
     """All reasons, the most important first. Where the pose may be another one altogether, those against the
-    lens are no causes: at a wrong pose some wrong lens always fits better."""
-    return (*reasons, *of_lens) if contrast_reasons(contrast) else (*of_lens, *reasons)
+    lens are no causes: at a wrong pose some wrong lens always fits better.
+
+    Args:
+        of_pose: those of the reasons that say so: :func:`contrast_reasons` and :func:`motion_reasons`.
+    """
+    return (*reasons, *of_lens) if of_pose else (*of_lens, *reasons)
 
 
 def contrast_reasons(contrast: EdgeContrast) -> list[str]:

@@ -1,4 +1,5 @@
-"""The halves of a drive by edges: they agree on a drive as it is, and contradict each other after a knock."""
+"""The halves of a drive by edges: they agree on a drive as it is, and contradict each other after a knock, or
+where the pictures of one are late."""
 
 from __future__ import annotations
 
@@ -17,11 +18,12 @@ from sst_graph.batch.by_edges.parts import thinned
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.graph.known import KnownCalibration
 from sst_graph.graph.outer_loop import JointProblem
 from sst_graph.graph.state import State
 from sst_graph.simulator import SimulationConfig
-from sst_graph.types import Guess
-from studies.subtle_faults import knocked
+from sst_graph.types import CameraImage, Guess
+from studies.subtle_faults import knocked, with_numbered_images
 
 STREET = SimulationConfig(
     seed=504,
@@ -68,6 +70,34 @@ def test_a_knock_is_named_though_the_estimate_fits_one_half() -> None:
     turned = gtsam.Pose3(gtsam.Rot3.Ry(np.radians(-3.0)), np.zeros(3))
     (other,) = halves_reasons(problem, replace(state, cTl=state.cTl * turned), COVARIANCE)
     assert "(pitch)" in other
+
+
+def late_from(drive: KeptDrive, first: int) -> KeptDrive:
+    """From some frame on each picture is the one before, as where the camera's driver holds one back."""
+    images = [frame.image for frame in drive.frames]
+
+    def late(k: int, image: CameraImage) -> CameraImage:
+        before = images[k - 1] if k >= first else image
+        return image if before is None else replace(before, stamp_ns=image.stamp_ns)
+
+    return with_numbered_images(drive, late)
+
+
+@pytest.mark.slow
+def test_pictures_that_are_late_in_one_half_are_named_as_such() -> None:
+    """What motion says of the time offset is of the first half, and must not hold the second one there."""
+    problem, state = problem_of(late_from(street(), 10))
+    known = replace(problem, prior=KnownCalibration(state, COVARIANCE))
+    (reason,) = halves_reasons(known, state, COVARIANCE)
+    assert "the later ones differ in time offset by -10" in reason or "time offset by -9" in reason
+    assert "check whether an image or a scan was lost or a clock was set, and calibrate" in reason
+
+
+@pytest.mark.slow
+def test_what_is_known_of_a_drive_as_it_is_contradicts_neither_half() -> None:
+    problem, state = problem_of(street())
+    known = replace(problem, prior=KnownCalibration(state, COVARIANCE))
+    assert halves_reasons(known, state, COVARIANCE) == ()
 
 
 @pytest.mark.slow

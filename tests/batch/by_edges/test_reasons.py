@@ -13,6 +13,7 @@ from sst_graph.batch.by_edges.reasons import (
     EdgeContrast,
     contrast_reasons,
     edges_reasons,
+    motion_reasons,
     with_lens_reasons,
 )
 from sst_graph.graph.state import State
@@ -22,7 +23,8 @@ LENS = ("the pictures look distorted: k1 = -0.1 ± 0.017",)
 
 def test_a_lens_is_blamed_first_where_the_pose_is_right() -> None:
     right = EdgeContrast(score=500.0, sigmas=12.0, ratio=2.0, other=300.0)
-    assert with_lens_reasons(("farther edges",), LENS, right) == (*LENS, "farther edges")
+    of_pose = contrast_reasons(right)
+    assert with_lens_reasons(("farther edges",), LENS, of_pose) == (*LENS, "farther edges")
 
 
 def test_a_pose_that_may_be_wrong_altogether_is_said_before_its_lens() -> None:
@@ -31,7 +33,7 @@ def test_a_pose_that_may_be_wrong_altogether_is_said_before_its_lens() -> None:
         EdgeContrast(score=502.0, sigmas=12.0, ratio=2.0, other=476.0),
     ):
         reasons = tuple(contrast_reasons(doubtful))
-        assert len(reasons) == 1 and with_lens_reasons(reasons, LENS, doubtful) == (*reasons, *LENS)
+        assert len(reasons) == 1 and with_lens_reasons(reasons, LENS, reasons) == (*reasons, *LENS)
 
 
 @pytest.mark.parametrize(("pitch_deg", "contradicts"), [(0.3, False), (0.7, False), (1.5, True)])
@@ -46,3 +48,7 @@ def test_a_pitch_that_motion_knows_better_is_contradicted(pitch_deg: float, cont
     right = EdgeContrast(score=500.0, sigmas=12.0, ratio=2.0, other=300.0)
     reasons = edges_reasons(solution, right, motion, own, truth)
     assert any("motion alone gives another calibration" in reason for reason in reasons) == contradicts
+    # Pictures of the camera beside lead to such a pose, and to a wrong principal point that fits it.
+    of_pose = motion_reasons(solution.state, motion, own)
+    first = with_lens_reasons(reasons, LENS, of_pose)[0]
+    assert (first in of_pose) == contradicts and (first in LENS) != contradicts
