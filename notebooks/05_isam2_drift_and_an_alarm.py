@@ -90,9 +90,10 @@ alarms = [update.frame for update in updates if update.alarm]
 print("alarm in frame", alarms, " status by frame:", " ".join(update.status for update in updates))
 
 # %% [markdown]
-# The first estimate needs some frames. After the knock the statistic is past its threshold at once; three
-# contradicting frames in a row make the alarm. The old estimate is then dropped, and a new one is made of
-# the frames after the knock.
+# The first estimate needs some frames. The statistic compares the latest four frames with the estimate, so
+# the first frame after the knock raises it nearly to the threshold, and the second past it. Three frames in
+# a row past the threshold make the alarm. The old estimate is then dropped, and a new one is made of the
+# frames after the knock.
 
 # %%
 known = [update for update in updates if update.covariance is not None]
@@ -146,6 +147,11 @@ for name, drift in (
     found = [drifting.add(turned(frame, DRIFT_DEG * frame.index)) for frame in drive]
     tracked[name] = [update for update in found if update.covariance is not None]
 
+# %% [markdown]
+# The random walk follows more closely, and the truth lies in its band. The band is wide where an epoch begins
+# (frames 10 and 20), for few frames tell about it; it narrows until the next one.
+
+# %%
 figure, ax = plt.subplots(figsize=(9, 3.6))
 for name, found in tracked.items():
     yaws = np.array([yaw_deg(update) for update in found])

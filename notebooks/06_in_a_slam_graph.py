@@ -164,6 +164,10 @@ figure.tight_layout()
 #
 # `IncrementalTerms` wraps a solver of yours, here `ISAM2`, and swaps the factors of its terms as the
 # estimate moves. Loop closures enter with the later of their two scans.
+#
+# While the kernel is wide (`update.kernel_px`), the covariance is the solver's own: it counts matches as
+# independent and contains the proximal prior, and is too small. So the curves below rise once, where the
+# kernel has become narrow and the cluster-robust covariance takes over.
 
 # %%
 parameters = gtsam.ISAM2Params()

@@ -198,6 +198,12 @@ def test_a_graph_of_your_own_without_labels(tmp_path: Path) -> None:
     assert solution.converged
     assert (np.abs([*apart, late]) < 4.0 * np.sqrt(np.diag(solution.covariance))).all()
     assert np.degrees(np.linalg.norm(apart[:3])) < 0.35 and abs(late) < 0.01
+    # the same images frame by frame, but for the last four
+    update = found["update"]
+    apart = truth.cTl.localCoordinates(update.values.atPose3(found["E"](0)))
+    late = update.values.atVector(found["D"](0))[0] - truth.time_offset_s
+    assert update.converged
+    assert (np.abs([*apart, late]) < 4.0 * np.sqrt(np.diag(update.covariance))).all()
 
 
 def test_links_between_pages_lead_somewhere() -> None:

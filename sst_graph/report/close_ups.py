@@ -27,7 +27,7 @@ from sst_graph.types import FloatArray, IntArray, SemanticClass
 COUNT = 10
 """Close-ups of a report."""
 _WORST = 3
-"""How many of them are those whose labels, or edges, agree least."""
+"""How many of them, at most, are those whose labels, or edges, agree least."""
 _PARTS = 3
 """Parts of the record in each of which an object may be shown."""
 _APART_PX = 120.0
@@ -69,8 +69,8 @@ class ObjectInFrame:
 
 
 def telling_detections(points: PointResiduals, covariance: FloatArray) -> list[ObjectInFrame]:
-    """Objects of which what is shown determines most, then those that agree least; with few of them, the same
-    in other frames.
+    """Objects of which what is shown determines most, then those that agree least, worse than half of all;
+    with few of them, the same in other frames.
 
     Args:
         covariance: (7, 7) of the result.
@@ -95,9 +95,12 @@ def telling_detections(points: PointResiduals, covariance: FloatArray) -> list[O
         seen.add(track)
     parts = points.frames * _PARTS // frames
     ranked = _apart([*firsts, *again], points, parts)
-    strong, others = ranked[: COUNT - _WORST], ranked[COUNT - _WORST :]
-    least = sorted(others, key=lambda one: -_misfit_px(points.take(one.points)))[:_WORST]
-    return [*strong, *(ObjectInFrame(one.points, one.share, True) for one in least)]
+    misfits = [_misfit_px(points.take(one.points)) for one in ranked]
+    usual = float(np.median(misfits)) if misfits else 0.0
+    off = [k for k in range(COUNT - _WORST, len(ranked)) if misfits[k] > usual]
+    least = sorted(off, key=lambda k: -misfits[k])[:_WORST]
+    strong = [one for k, one in enumerate(ranked) if k not in least][: COUNT - len(least)]
+    return [*strong, *(replace(ranked[k], worst=True) for k in least)]
 
 
 def _apart(ranked: Sequence[ObjectInFrame], points: PointResiduals, parts: IntArray) -> list[ObjectInFrame]:

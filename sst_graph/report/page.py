@@ -207,7 +207,7 @@ def _next(inspection: Inspection) -> str:
         paragraph(_weakest(inspection)) if trusted and not is_start(result) and not named else "",
         paragraph(
             "What to record next, by the information that the frames of this record gave "
-            "(standard deviations, now -> then):"
+            "(standard deviations, now -> then; x, y and z are the LiDAR's axes):"
         )
         if advice
         else "",

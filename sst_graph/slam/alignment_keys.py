@@ -41,6 +41,11 @@ COLUMNS = POSITIONS.stop
 :data:`POSITIONS`."""
 
 
+SAME_STAMP_NS = 2_000
+"""Stamps of a scan and of its pose may differ by this [ns]: seconds as a ``double`` are good to 0.4 us in our
+century, a text with six decimals to 1 us. At 30 m/s a body moves by 0.06 mm in that time."""
+
+
 def bias_column(semantic_class: SemanticClass) -> int:
     """Place of a class's mask bias among :data:`COLUMNS`."""
     return 7 + _CLASSES.index(semantic_class)
@@ -114,14 +119,28 @@ class Trajectory:
         return self._keys[position], self._stamps[position]
 
     def position(self, stamp_ns: int) -> int | None:
-        """Position of the pose with just this stamp; None where there is none.
+        """Position of the pose with this stamp, to :data:`SAME_STAMP_NS`; None where there is none.
 
         Raises:
             DataError: no stamp.
         """
+        at = self._nearest(stamp_ns)
+        return None if at is None or abs(self._stamps[at] - stamp_ns) > SAME_STAMP_NS else at
+
+    def nearest_s(self, stamp_ns: int) -> float:
+        """How far the pose nearest to a stamp lies from it [s]; inf where there is no pose.
+
+        Raises:
+            DataError: no stamp.
+        """
+        at = self._nearest(stamp_ns)
+        return float("inf") if at is None else 1e-9 * abs(self._stamps[at] - stamp_ns)
+
+    def _nearest(self, stamp_ns: int) -> int | None:
         stamp_ns = checked_stamp(stamp_ns, "a pose")
-        at = bisect_left(self._stamps, stamp_ns)
-        return at if at < len(self) and self._stamps[at] == stamp_ns else None
+        after = bisect_left(self._stamps, stamp_ns)
+        beside = range(max(after - 1, 0), min(after + 1, len(self)))
+        return min(beside, key=lambda at: abs(self._stamps[at] - stamp_ns), default=None)
 
     def interval(self, true_ns: float) -> int | None:
         """Position of the pose before a time that lies between two poses; None outside of all.
@@ -178,7 +197,7 @@ class AlignmentKeys:
     """Keys of the terms of one camera in a graph.
 
     Attributes:
-        trajectory: poses wTb of the body, one at each scan's stamp.
+        trajectory: poses wTb of the body, one at each scan's stamp (to :data:`SAME_STAMP_NS`).
         cTl: key of the extrinsic, or a fixed pose.
         time_offset_s: key of the time offset (``Vector(1)`` or ``double``), or a fixed offset [s].
         biases_px: by class, key of its mask bias or a fixed bias [px]; none where a class is missing.

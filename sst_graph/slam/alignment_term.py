@@ -72,7 +72,7 @@ class TermState(Enum):
     BEFORE_TRAJECTORY = "stamp + offset lies before the first pose"
     AFTER_TRAJECTORY = "stamp + offset lies after the last pose"
     NO_SCAN_POSE = "the trajectory has no pose at the scan's stamp"
-    POSE_MISSING = "a pose around stamp + offset is not among the values"
+    POSE_MISSING = "a pose at the scan's stamp, or around stamp + offset, is not among the values"
 
 
 @dataclass(frozen=True)
@@ -141,6 +141,7 @@ class TermMatches:
         state: whether there is a factor.
         kernel_px: scale of the robust kernel under which the matches were made [px].
         outside_s: how far stamp + offset lies outside of the trajectory [s]; negative before it.
+        pose_away_s: of ``NO_SCAN_POSE``, the least interval between a scan's stamp and a pose [s].
         place: poses around the image; None outside of the trajectory.
         found: the matches.
         factor: of them; None where the state is not ``MATCHED``.
@@ -156,6 +157,7 @@ class TermMatches:
     information: float = 1.0
     term: AlignmentTerm | None = field(default=None, repr=False)
     made_at: tuple[FloatArray, ...] = field(default=(), repr=False)
+    pose_away_s: float = 0.0
 
     def __len__(self) -> int:
         return len(self.found)
@@ -167,6 +169,8 @@ class TermMatches:
 
     def __str__(self) -> str:
         outside = f", by {1e3 * abs(self.outside_s):.0f} ms" if self.outside_s else ""
+        if self.state is TermState.NO_SCAN_POSE:
+            outside = f", the nearest is {1e3 * self.pose_away_s:.3g} ms away"
         found = count_of(len(self), "match", "matches")
         return f"{self.state.value}{outside}: {found}, kernel {self.kernel_px:.1f} px"
 
@@ -287,7 +291,10 @@ class AlignmentTerm:
             return TermMatches(state, 0.0, outside_s)
         scan, of_scan = self._nearest_scan(true_ns, values)
         if of_scan is None:
-            return TermMatches(TermState.NO_SCAN_POSE, 0.0)
+            if any(trajectory.position(each.stamp_ns) is not None for each in self.features):
+                return TermMatches(TermState.POSE_MISSING, 0.0)
+            away_s = min(trajectory.nearest_s(each.stamp_ns) for each in self.features)
+            return TermMatches(TermState.NO_SCAN_POSE, 0.0, pose_away_s=away_s)
         (X_a, stamp_a_ns), (X_b, stamp_b_ns) = trajectory.at(a), trajectory.at(a + 1)
         poses = X_a, X_b, trajectory.at(of_scan)[0]
         if not all(values.exists(key) for key in poses):

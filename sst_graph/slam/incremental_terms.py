@@ -199,7 +199,8 @@ class IncrementalTerms:
         if matches and self._kernel_px == self._config.last_px:
             warnings = warnings + last_warnings(matches, estimate, covariance, self._config)
             point = self._solver.getLinearizationPoint()
-            warnings = warnings + far_linearization(self._keys, matches, point, estimate)
+            smoother = not isinstance(self._solver, gtsam.ISAM2)
+            warnings = warnings + far_linearization(self._keys, matches, point, estimate, smoother)
             if found is not None:
                 P, cTl = self._marginal()[:7, :7], self._keys.extrinsic(estimate)
                 warnings = warnings + covariance_warnings(P, found, cTl, self._config)

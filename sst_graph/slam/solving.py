@@ -24,7 +24,7 @@ from sst_graph.errors import EstimationError, count_of
 from sst_graph.factors.custom.variables import checked_problem
 from sst_graph.factors.priors import time_offset_prior
 from sst_graph.slam.alignment_keys import AlignmentKeys
-from sst_graph.slam.alignment_term import AlignmentTerm, TermMatches
+from sst_graph.slam.alignment_term import AlignmentTerm, TermMatches, TermState
 from sst_graph.slam.checked_terms import checked_terms, expect_factors_of
 from sst_graph.slam.config import CALM, RematchConfig
 from sst_graph.slam.covariance import (
@@ -160,6 +160,9 @@ def match_all(
     matches = [term.matched(values, kernel_px, information) for term in terms]
     if all(each.factor is None for each in matches):
         states = ", ".join(sorted({each.state.value for each in matches}))
+        away_s = [each.pose_away_s for each in matches if each.state is TermState.NO_SCAN_POSE]
+        if away_s:
+            states += f": the nearest pose is {1e3 * min(away_s):.3g} ms from a scan"
         found = f"no factor in {count_of(len(terms), 'term')} ({states})"
         raise EstimationError(f"alignment: found {found}, expected one or more")
     return matches

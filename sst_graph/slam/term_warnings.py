@@ -115,18 +115,29 @@ def far_from_start(
 
 
 def far_linearization(
-    keys: AlignmentKeys, matches: Sequence[TermMatches], point: gtsam.Values, values: gtsam.Values
+    keys: AlignmentKeys,
+    matches: Sequence[TermMatches],
+    point: gtsam.Values,
+    values: gtsam.Values,
+    smoother: bool = False,
 ) -> list[TermWarning]:
     """A warning where the solver's linear model of extrinsic and offset was made elsewhere in the image.
 
     Args:
         point: the solver's linearization point.
+        smoother: whether it marginalizes poses. It then linearizes extrinsic and offset never again, whatever
+            its parameters are: they are on the factor that stands for what has left.
     """
     step = _step(keys, point, values)
     far_px = uncertainty_px(matches, values, np.outer(step, step))
     if not np.isfinite(far_px) or far_px <= MOST_LINEAR_PX:
         return []
     advice = "ISAM2Params: relinearizeSkip = 1, setRelinearizeThreshold(1e-4)"
+    if smoother:
+        advice += (
+            "; a smoother that has them keeps extrinsic and time offset linearized where they were when the "
+            "first pose left it: begin nearer, or with a longer lag"
+        )
     return [TermWarning(WarningKind.FAR_LINEARIZATION, far_px, MOST_LINEAR_PX, "px", advice)]
 
 

@@ -409,6 +409,29 @@ def test_the_telling_objects_are_different_ones_first(by: str) -> None:
     assert sum(one.share for one in chosen) < 1.0
 
 
+def test_an_object_that_agrees_as_well_as_others_is_not_called_the_least() -> None:
+    """Eight of one size of residual and two that are off: only these two agree least."""
+    rng, each, sizes = np.random.default_rng(0), 20, [1.0] * 8 + [3.0, 4.0]
+    chosen_from = _fit().points
+    points = chosen_from.take(rng.integers(0, len(chosen_from), each * len(sizes)))
+    objects = np.repeat(np.arange(len(sizes)), each)
+    points = replace(
+        points,
+        frames=objects,
+        tracks=objects,
+        pixels=np.column_stack([150.0 * objects, np.full(len(objects), 100.0)]),
+        residuals_px=np.repeat(sizes, each),
+        # what determines most comes first
+        weights=np.repeat(np.linspace(1.0, 0.1, len(sizes)), each),
+        J=np.ones_like(points.J),
+        sigmas_px=np.ones(len(objects)),
+    )
+    chosen = telling_detections(points, np.eye(7))
+    of = [int(objects[one.points[0]]) for one in chosen]
+    assert of == [0, 1, 2, 3, 4, 5, 6, 7, 9, 8]
+    assert [one.worst for one in chosen] == [False] * 8 + [True] * 2
+
+
 def test_close_ups_are_eight_times_enlarged() -> None:
     """52 by 39 pixels of the picture, each 8 px of the page, which a column of the page has room for."""
     found = re.findall(r'class="closeup" viewBox="0 0 (\d+) (\d+)"', _page())

@@ -6,11 +6,13 @@ import gtsam
 import numpy as np
 import pytest
 from alignment_streets import OBJECTS
+from stored import simulated
 
 from sst_graph import follow_objects
 from sst_graph.drive.preparation import ScanFeatures
 from sst_graph.errors import DataError
 from sst_graph.features.lidar_edges import Boundaries, Edge
+from sst_graph.simulator import SimulationConfig
 from sst_graph.types import SemanticClass
 
 OBJECT = SemanticClass.OBJECT
@@ -73,3 +75,21 @@ def test_one_pose_a_scan() -> None:
     scan, wTl = box_scan(0, [np.array([20.0, 3.0])])
     with pytest.raises(DataError, match="1 pose, expected 2, one a scan"):
         follow_objects([scan, scan], [wTl], OBJECTS)
+
+
+@pytest.mark.slow
+def test_following_features_is_following_their_scans() -> None:
+    """As edges.md does frame by frame: the features of a scan alone are whole, and may be given again."""
+    street = SimulationConfig(seed=504, frames=12, motion="no_stop", azimuth_limit_deg=50.0)
+    drive = simulated(street)
+    scans = [drive[k].scan for k in range(8)]
+    wTls = [drive.wTl(1e-9 * scan.stamp_ns) for scan in scans]
+    alone = [
+        follow_objects([scan], [wTl], OBJECTS).features[0] for scan, wTl in zip(scans, wTls, strict=True)
+    ]
+    by_scans, by_features = follow_objects(scans, wTls, OBJECTS), follow_objects(alone, wTls, OBJECTS)
+    assert any(by_scans.l_velocities)
+    for own, other in zip(by_scans.l_velocities, by_features.l_velocities, strict=True):
+        assert own.keys() == other.keys() and all(np.array_equal(own[name], other[name]) for name in own)
+    for a, b in zip(by_scans.features, by_features.features, strict=True):
+        np.testing.assert_array_equal(a.boundaries[OBJECT].lPs, b.boundaries[OBJECT].lPs)

@@ -19,7 +19,7 @@ from sst_graph.slam.align import VEHICLES, features_of
 from sst_graph.slam.alignment_term import TermConfig, TermMatches, TermState
 from sst_graph.slam.config import RematchConfig
 from sst_graph.slam.incremental_terms import IncrementalTerms, Solver
-from sst_graph.slam.solving import RematchSolution
+from sst_graph.slam.solving import RematchSolution, match_all
 from sst_graph.slam.term_warnings import WarningKind
 from sst_graph.types import SemanticClass
 
@@ -153,8 +153,37 @@ def test_a_solver_that_does_not_relinearize_is_named(street: Street) -> None:
     found = street.frame_by_frame(gtsam.ISAM2(), street.start(1))
     (warning,) = [w for w in found.warnings if w.kind is WarningKind.FAR_LINEARIZATION]
     assert warning.value > warning.limit and "relinearizeSkip = 1" in str(warning)
+    assert "smoother" not in str(warning)
     found = street.frame_by_frame(gtsam.ISAM2(isam2_params()), street.start(1))
     assert WarningKind.FAR_LINEARIZATION not in [w.kind for w in found.warnings]
+
+
+@pytest.mark.slow
+def test_a_smoother_is_told_what_its_parameters_do_not_change(street: Street) -> None:
+    solver = gtsam.IncrementalFixedLagSmoother(1.25, gtsam.ISAM2Params())
+    found = street.frame_by_frame(solver, street.start(1))
+    (warning,) = [w for w in found.warnings if w.kind is WarningKind.FAR_LINEARIZATION]
+    assert "relinearizeSkip = 1" in str(warning) and "longer lag" in str(warning)
+
+
+@pytest.mark.parametrize("lag_s", [3.0, 100.0])
+def test_a_smoother_linearizes_no_more_what_a_marginalized_factor_holds(lag_s: float) -> None:
+    """The fact of gtsam that the warning states: E on poses that all say another one."""
+    solver = gtsam.IncrementalFixedLagSmoother(lag_s, isam2_params())
+    noise = gtsam.noiseModel.Isotropic.Sigma(6, 0.1)
+    for k in range(8):
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        if k == 0:
+            values.insert(E, gtsam.Pose3())
+            graph.add(gtsam.PriorFactorPose3(E, gtsam.Pose3(), noise))
+        values.insert(X(k), gtsam.Pose3())
+        graph.add(gtsam.PriorFactorPose3(X(k), gtsam.Pose3(), noise))
+        seen = gtsam.Pose3(gtsam.Rot3(), np.array([0.1 * k, 0.0, 0.0]))
+        graph.add(gtsam.BetweenFactorPose3(X(k), E, seen, noise))
+        solver.update(graph, values, {X(k): float(k), E: float(k)})
+        solver.update()
+    behind_m = solver.calculateEstimatePose3(E).x() - solver.getLinearizationPoint().atPose3(E).x()
+    assert (behind_m > 0.1) == (lag_s < 8.0)
 
 
 # --- one term
@@ -203,11 +232,40 @@ def test_an_image_beyond_the_trajectory_is_reported(
 
 def test_missing_poses_are_reported(street: Street) -> None:
     _, values = street.whole((street.cTl, street.time_offset_s))
-    other = Trajectory([X(k) for k in range(24)], [stamp + 1 for stamp in street.stamps_ns])
-    assert street.term(4, AlignmentKeys(other, E, D)).matched(values, 5.0).state is TermState.NO_SCAN_POSE
+    other = Trajectory([X(k) for k in range(24)], [stamp + 20_000_000 for stamp in street.stamps_ns])
+    term = street.term(4, AlignmentKeys(other, E, D))
+    matches = term.matched(values, 5.0)
+    assert matches.state is TermState.NO_SCAN_POSE and matches.pose_away_s == pytest.approx(0.02)
+    assert "the nearest is 20 ms away" in str(matches)
+    with pytest.raises(EstimationError, match="the nearest pose is 20 ms from a scan"):
+        match_all([term], values, 5.0, 1.0)
     values.erase(X(5))
     term = street.term(4, AlignmentKeys(street.trajectory(), E, D))
     assert term.matched(values, 5.0).state is TermState.POSE_MISSING
+    for k in (2, 3, 4, 6):
+        values.erase(X(k))
+    missing = term.matched(values, 5.0)
+    assert missing.state is TermState.POSE_MISSING and "scan's stamp" in str(missing)
+
+
+def test_stamps_that_were_seconds_are_those_of_the_scans(street: Street) -> None:
+    """A pose's stamp in seconds, as a double or a text with six decimals, is some hundred nanoseconds off."""
+    base_ns = 1_700_000_000_123_456_789
+    _, values = street.whole((street.cTl, street.time_offset_s))
+    scans = [replace(scan, stamp_ns=base_ns + scan.stamp_ns) for scan in street.scans[2:7]]
+    image = replace(street.images[4], stamp_ns=base_ns + street.images[4].stamp_ns)
+    whole = [base_ns + stamp for stamp in street.stamps_ns]
+    found = []
+    for stamps in (whole, [int(1e9 * (1e-9 * ns)) for ns in whole], [ns // 1000 * 1000 for ns in whole]):
+        keys = AlignmentKeys(Trajectory([X(k) for k in range(24)], stamps), E, D)
+        matches = AlignmentTerm(scans, image, street.camera, keys).matched(values, 5.0)
+        assert matches.factor is not None
+        found.append((len(matches), matches.factor.error(values)))
+    assert found[0][0] == found[1][0] == found[2][0]
+    assert [error for _, error in found] == pytest.approx([found[0][1]] * 3, rel=1e-4)
+    with pytest.raises(DataError, match="a pose"):
+        Trajectory().nearest_s(0.5)  # type: ignore[arg-type]
+    assert Trajectory().nearest_s(5) == float("inf") and Trajectory().position(5) is None
 
 
 def test_few_matches_are_reported(street: Street) -> None:
