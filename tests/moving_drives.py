@@ -40,15 +40,21 @@ def resting(t: float) -> gtsam.Pose3:
 
 
 def made_drive(
-    wTl: PoseAt, frames: int = 50, seed: int = 0, noise: float = 1.0, yaw_noise: float = 1.0
+    wTl: PoseAt,
+    frames: int = 50,
+    seed: int = 0,
+    noise: float = 1.0,
+    yaw_noise: float = 1.0,
+    lidar_noise: float = 1.0,
 ) -> Drive:
     """Odometry of both sensors under known noise; the LiDAR's poses err, not its steps.
 
     Args:
+        lidar_noise: factor on the noise of the LiDAR alone, of which the odometry does not know.
         yaw_noise: factor on the LiDAR's noise about its z axis, of which the odometry does not know.
     """
     rng = np.random.default_rng(seed)
-    sigmas = noise * np.repeat([SIGMA_RAD, SIGMA_M], 3)
+    sigmas = noise * lidar_noise * np.repeat([SIGMA_RAD, SIGMA_M], 3)
     sigmas[2] *= yaw_noise
     stamps = [round(k * PERIOD_S * 1e9) for k in range(frames)]
     poses = [wTl(s * 1e-9).retract(sigmas * rng.standard_normal(6)) for s in stamps]

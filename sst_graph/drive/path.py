@@ -36,8 +36,9 @@ class PathSteps:
         twists_a, twists_b: (m, 6) its twist at both ends, in its own frame [rad/s, m/s].
         covariances: (m, 6, 6) of aTb, [rot rad, trans m], right perturbation: by the noise of the poses and
             by what is between the stamps and not known.
-        covariance_rates: (m, 6, 6) its change as both ends move on in time [1/s]: between two stamps the
-            noise of their poses is averaged, at a stamp it is not.
+        noise_rates: (m, 6) change of the variances of aTb as both ends move on in time [1/s]: between two
+            stamps the noise of their poses is averaged, at a stamp it is not. By the noise that the poses
+            show, which is at most what they state; 0 where they are too few to show it.
         twist_covariances: (m, 6, 6) of the rate at which aTb changes as both ends move on.
     """
 
@@ -46,7 +47,7 @@ class PathSteps:
     twists_a: FloatArray
     twists_b: FloatArray
     covariances: FloatArray
-    covariance_rates: FloatArray
+    noise_rates: FloatArray
     twist_covariances: FloatArray
 
     def __len__(self) -> int:
@@ -119,7 +120,7 @@ class SensorPath:
             twists[place[0]],
             twists[place[1]],
             of_pose * products[:, 0, 0, None, None] + between[:, :, None] * np.eye(6),
-            of_pose * (2.0 * products[:, 0, 1, None, None]),
+            2.0 * products[:, 0, 1, None] * np.minimum(np.einsum("nii->ni", of_pose), self._pose_noise),
             of_pose * products[:, 1, 1, None, None],
         )
 

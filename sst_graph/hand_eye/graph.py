@@ -296,11 +296,15 @@ def _scaled(terms: HandEyeTerms, scales: NoiseScales, weights: FloatArray) -> Ha
     widened[~terms.residuals.directed, 3:] = 1.0
     own = widened[:, :, None] * widened[:, None, :] * terms.covariances
     carried = spread[:, :, None] * terms.rows_H_step
-    slopes = _noise_slopes(own, carried, terms.pairs.lidars)
+    slopes = _noise_slopes(own, terms.rows_H_step, terms.pairs.lidars)
     return replace(terms, covariances=own, noise_slopes=slopes, rows_H_step=carried)
 
 
 def _noise_slopes(covariances: FloatArray, rows_H_step: FloatArray, lidars: PathSteps) -> FloatArray:
-    """``noise_slopes`` of :class:`HandEyeTerms`."""
-    rates = rows_H_step @ lidars.covariance_rates @ np.swapaxes(rows_H_step, 1, 2)
-    return np.asarray(0.5 * np.trace(np.linalg.solve(covariances, rates), axis1=1, axis2=2))
+    """``noise_slopes`` of :class:`HandEyeTerms`.
+
+    By the noise that the path itself shows, whatever the covariances allow for: more would draw the offset to
+    the LiDAR's stamps.
+    """
+    back = np.swapaxes(rows_H_step, 1, 2) @ np.linalg.solve(covariances, rows_H_step)
+    return np.asarray(0.5 * np.einsum("nii,ni->n", back, lidars.noise_rates))

@@ -89,6 +89,21 @@ def test_a_straight_road_leaves_the_roll_and_the_offset_open() -> None:
     assert error @ np.linalg.solve(result.covariance, error) < 20.0
 
 
+def gentle(t: float) -> gtsam.Pose3:
+    """Pose at a time [s]: 3 m/s, weaving on level ground."""
+    return gtsam.Pose3(gtsam.Rot3.Rz(0.2 * np.sin(0.9 * t)), np.array([3.0 * t, 0.0, 0.0]))
+
+
+@pytest.mark.parametrize("lidar_noise", [0.2, 1.0])
+def test_noise_of_the_lidar_does_not_draw_the_offset_to_its_stamps(lidar_noise: float) -> None:
+    """Between two stamps it is averaged: what that gains is taken off, and no more where it is small."""
+    errors = []
+    for seed in range(10):
+        drive = made_drive(gentle, 30, seed, lidar_noise=lidar_noise)
+        errors.append(1e3 * error_of(solve_motion([drive], Guess(TRUE, OFFSET_S))[0])[6])
+    assert abs(np.mean(errors)) < 1.0
+
+
 def test_noise_is_no_turning() -> None:
     """On a straight road the LiDAR's noise alone must tell no offset, wherever between stamps it falls."""
     found = [solve_motion([made_drive(straight, seed=seed)], Guess(TRUE, OFFSET_S))[0] for seed in range(2)]
