@@ -148,8 +148,8 @@ for name, drift in (
     tracked[name] = [update for update in found if update.covariance is not None]
 
 # %% [markdown]
-# The random walk follows more closely, and the truth lies in its band. The band is wide where an epoch begins
-# (frames 10 and 20), for few frames tell about it; it narrows until the next one.
+# The random walk follows more closely, and the truth lies in its band. Where an epoch begins (frames 10 and
+# 20) the band widens by what the calibration may have walked; frames of the epoch narrow it again.
 
 # %%
 figure, ax = plt.subplots(figsize=(9, 3.6))

@@ -415,6 +415,19 @@ def test_a_slow_drift_is_followed(street: SimulatedDrive, frames: list[Frame]) -
     assert abs(at_end[0]) < 0.5 * abs(at_end[1])
 
 
+@pytest.mark.slow
+def test_a_new_epoch_is_less_sure_by_the_walk_alone(street: SimulatedDrive, frames: list[Frame]) -> None:
+    """The running covariance is that of the history, which adds epoch to epoch."""
+    drift = DriftConfig(enabled=True, rotation_deg=0.5)
+    tracker = tracker_from_truth(street, dataclasses.replace(EARLY_START, window=10, drift=drift))
+    ratios = []
+    for frame in frames:
+        update = tracker.add(frame)
+        if update.covariance is not None and len(history := tracker.estimate.history()) > 1:
+            ratios.append(np.sqrt(np.diag(update.covariance) / np.diag(history[-1].covariance)))
+    assert len(ratios) > 15 and np.min(ratios) > 0.8 and np.max(ratios) < 1.25
+
+
 def _yaw_error(
     street: SimulatedDrive, found: HistoryEntry | TrackUpdate, yaw_deg: float
 ) -> tuple[float, float]:

@@ -97,6 +97,21 @@ class RunningSums:
         self.by_shifts = T @ self.by_shifts @ T.T
         self.objects.transform(T[: len(T) - self.held, : T.shape[1] - self.held])
 
+    def carried(
+        self, pairs: Sequence[LinearizedPair], columns: Sequence[IntArray], T: FloatArray
+    ) -> RunningSums:
+        """With further pairs, and then through a random walk; the matches object by object stay as they are.
+
+        Args:
+            pairs, columns: as those of :meth:`excess`.
+            T: (n, n) of :meth:`Gaussian.transition`, held parameters included.
+        """
+        n = self.size + self.held
+        scores = total(n, [self.scores, *(pair.scores for pair in pairs)], [np.arange(n), *columns])
+        by_shifts = T @ (self.by_shifts + _squares(pairs, columns, n)) @ T.T
+        shifts = sum((pair.shifts for pair in pairs), self.shifts)
+        return replace(self, scores=scores.transformed(T), by_shifts=by_shifts, shifts=shifts)
+
     def copy(self) -> RunningSums:
         recent = deque(self.recent, self.recent.maxlen)
         return replace(self, last_seen=dict(self.last_seen), recent=recent, objects=self.objects.copy())

@@ -363,7 +363,8 @@ class WindowSmoother:
         Args:
             with_held: over the held parameters of ``past``, too.
         """
-        return self.sums.excess(*self._window_columns(), self.model, with_held)
+        sums, window, columns = self._sums_of_last_epoch()
+        return sums.excess(window, columns, self.model, with_held)
 
     def shift_variances(self) -> FloatArray:
         """(3,) :meth:`RunningSums.shift_variances` over past and window."""
@@ -372,12 +373,26 @@ class WindowSmoother:
     def shift_excess(self) -> tuple[FloatArray, FloatArray]:
         """The same, and (3, n, n) what each adds to the variance of the score
         (:meth:`RunningSums.shift_excess`)."""
-        return self.sums.shift_excess(*self._window_columns())
+        sums, window, columns = self._sums_of_last_epoch()
+        return sums.shift_excess(window, columns)
 
-    def _window_columns(self) -> tuple[list[LinearizedPair], list[IntArray]]:
-        """The pairs of the window, and the columns of each in ``past``."""
-        window, point = [entry.linear for entry in self.entries.values()], self.past.point
-        return window, [point.columns(pair.information.point.tracks, self.past.held) for pair in window]
+    def _sums_of_last_epoch(self) -> tuple[RunningSums, list[LinearizedPair], list[IntArray]]:
+        """The sums over all that came before the last epoch, carried to it by the random walks; the pairs of
+        the window that it has, and the columns of each in ``past``."""
+        sums, total = self.sums, self.past
+        for old, new in pairwise(self.epochs):
+            window, columns = self._pairs_of(old)
+            total = replace(total, information=total.information_with([pair.information for pair in window]))
+            variances = self.walk(old, new)
+            sums = sums.carried(window, columns, total.transition(variances))
+            total = total.drifted(variances)
+        return (sums, *self._pairs_of(self.epochs[-1]))
+
+    def _pairs_of(self, epoch: Epoch) -> tuple[list[LinearizedPair], list[IntArray]]:
+        """The pairs of the window that see an epoch's calibration, and the columns of each in ``past``."""
+        point = self.past.point
+        pairs = [entry.linear for entry in self.entries.values() if entry.epoch == epoch.number]
+        return pairs, [point.columns(pair.information.point.tracks, self.past.held) for pair in pairs]
 
     @property
     def weight_curvature_ratio(self) -> float:
