@@ -11,7 +11,7 @@ import pytest
 from stored import simulated, stored
 from streets import LENS_STREET as STREET
 
-from sst_graph import CalibrationConfig, SemanticClass, calibrate
+from sst_graph import CalibrationConfig, CalibrationResult, SemanticClass, calibrate
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.batch.assumption_tests import ParameterTest, with_further_tests
 from sst_graph.batch.by_edges import covariance
@@ -139,20 +139,36 @@ def test_two_tests_of_a_parameter_are_weighted_by_their_variances() -> None:
     assert set(with_further_tests(labels, weak, 3.3)) == set(labels)
 
 
+def street(seed: int) -> KeptDrive:
+    return KeptDrive.of(simulated(replace(STREET, seed=seed, frames=24, motion="mixed")))
+
+
+def by_labels(own: KeptDrive, right_px: float) -> CalibrationResult:
+    """The result by labels, the principal point this far from the one given."""
+    config = with_overrides(CONFIG, ["find_causes=false"])
+    assert own.truth is not None
+    return calibrate(with_principal_point(own, right_px, 0.0), own.truth.cTl, config)
+
+
 @pytest.mark.slow
 def test_a_result_by_labels_is_not_ok_with_a_wrong_principal_point() -> None:
-    """Five of the sigmas that cx would have as a variable are found; less is found or in the sigmas."""
-    street = KeptDrive.of(simulated(replace(STREET, seed=507, frames=24, motion="mixed")))
-    config = with_overrides(CONFIG, ["find_causes=false"])
-    right, less, wrong = (
-        calibrate(with_principal_point(street, px, 0.0), truth().cTl, config) for px in (0.0, 6.0, 8.0)
-    )
+    """Five of the sigmas that cx would have as a variable are found."""
+    right, wrong = (by_labels(street(507), px) for px in (0.0, 8.0))
     assert right.status == "ok"
     assert wrong.status == "not_converged"
     assert wrong.reasons[0].startswith("the pictures lie beside the principal point cx: cx = ")
     assert wrong.diagnostics["assumptions"]["cx"]["estimate"] == pytest.approx(8.0, abs=2.5)
-    assert street.truth is not None
-    late_s = less.time_offset_s - street.truth.time_offset_s
-    error = tangent_error(less.T_camera_lidar, street.truth.cTl, late_s)
-    covered = bool((np.abs(error) < 3.0 * np.sqrt(np.diag(less.covariance))).all())
-    assert covered or less.status == "not_converged"
+
+
+@pytest.mark.slow
+def test_less_is_found_or_in_the_sigmas() -> None:
+    """Three to four of these sigmas on four streets: one of them may be neither, by a little."""
+    beyond = []
+    for own in map(street, range(507, 511)):
+        result = by_labels(own, 6.0)
+        assert own.truth is not None
+        late_s = result.time_offset_s - own.truth.time_offset_s
+        error = tangent_error(result.T_camera_lidar, own.truth.cTl, late_s)
+        if result.status == "ok":
+            beyond.append(float(np.max(np.abs(error) / np.sqrt(np.diag(result.covariance)))))
+    assert np.count_nonzero(np.array(beyond) > 3.0) <= 1 and max(beyond, default=0.0) < 3.5
