@@ -160,15 +160,17 @@ def test_a_result_by_labels_is_not_ok_with_a_wrong_principal_point() -> None:
     assert wrong.diagnostics["assumptions"]["cx"]["estimate"] == pytest.approx(8.0, abs=2.5)
 
 
+NEARLY = pytest.mark.xfail(strict=True, reason="6 px are not found, and the yaw is 3.1 sigma off")
+
+
 @pytest.mark.slow
-def test_less_is_found_or_in_the_sigmas() -> None:
-    """Three to four of these sigmas on four streets: one of them may be neither, by a little."""
-    beyond = []
-    for own in map(street, range(507, 511)):
-        result = by_labels(own, 6.0)
-        assert own.truth is not None
-        late_s = result.time_offset_s - own.truth.time_offset_s
-        error = tangent_error(result.T_camera_lidar, own.truth.cTl, late_s)
-        if result.status == "ok":
-            beyond.append(float(np.max(np.abs(error) / np.sqrt(np.diag(result.covariance)))))
-    assert np.count_nonzero(np.array(beyond) > 3.0) <= 1 and max(beyond, default=0.0) < 3.5
+@pytest.mark.parametrize("seed", [pytest.param(507, marks=NEARLY), 508, 509, 510])
+def test_less_is_found_or_in_the_sigmas(seed: int) -> None:
+    """Three to four of these sigmas."""
+    own = street(seed)
+    less = by_labels(own, 6.0)
+    assert own.truth is not None
+    late_s = less.time_offset_s - own.truth.time_offset_s
+    error = tangent_error(less.T_camera_lidar, own.truth.cTl, late_s)
+    covered = bool((np.abs(error) < 3.0 * np.sqrt(np.diag(less.covariance))).all())
+    assert covered or less.status == "not_converged"
