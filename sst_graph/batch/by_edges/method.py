@@ -22,10 +22,9 @@ from sst_graph.batch.by_edges.optimum import (
 from sst_graph.batch.by_edges.problem import LabelEstimate, checking_motion, edges_problem, motion_alone
 from sst_graph.batch.by_edges.reasons import (
     EdgeContrast,
-    contrast_reasons,
     edge_contrast,
     edges_reasons,
-    motion_reasons,
+    pose_reasons,
     with_lens_reasons,
 )
 from sst_graph.batch.config import CalibrationConfig
@@ -84,8 +83,8 @@ def edges_method(
         problem.subset_edges, solution.state, [one.state for _, one in candidates], config.seed
     )
     checking = checking_motion(motion, config)
-    reasons = edges_reasons(solution, contrast, checking, covariance, problem.centre)
-    of_pose = (*contrast_reasons(contrast), *motion_reasons(solution.state, checking, covariance))
+    of_pose = pose_reasons(solution.state, contrast, checking, covariance)
+    reasons = edges_reasons(solution, of_pose, problem.centre)
     reasons += unsettled
     if config.check_contradictions:
         all_points = replace(problem.whole, drives=calibration.drives)

@@ -109,28 +109,29 @@ def unsettled_reasons(step: FloatArray) -> tuple[str, ...]:
     )
 
 
-def edges_reasons(
-    solution: JointSolution,
-    contrast: EdgeContrast,
-    motion: MotionSolution | None,
-    covariance: FloatArray,
-    centre: State,
+def edges_reasons(solution: JointSolution, of_pose: Sequence[str], centre: State) -> tuple[str, ...]:
+    """Why the estimate may be wrong altogether; none where nothing says so.
+
+    Args:
+        of_pose: :func:`pose_reasons`.
+    """
+    moved = () if solution.converged else (still_moved(solution.outer_iterations),)
+    return (*moved, *of_pose, *far_reasons(solution.state.cTl, centre.cTl))
+
+
+def pose_reasons(
+    state: State, contrast: EdgeContrast, motion: MotionSolution | None, covariance: FloatArray
 ) -> tuple[str, ...]:
-    """Why the estimate may be wrong altogether; none where nothing says so."""
-    reasons = []
-    if not solution.converged:
-        reasons.append(still_moved(solution.outer_iterations))
-    reasons += contrast_reasons(contrast)
-    reasons += motion_reasons(solution.state, motion, covariance)
-    return (*reasons, *far_reasons(solution.state.cTl, centre.cTl))
-
-
-def motion_reasons(state: State, motion: MotionSolution | None, covariance: FloatArray) -> list[str]:
-    """Why an estimate may be wrong that motion contradicts.
+    """Why the pose may be another one altogether.
 
     Args:
         covariance: (7, 7) of the estimate.
     """
+    return (*contrast_reasons(contrast), *_motion_reasons(state, motion, covariance))
+
+
+def _motion_reasons(state: State, motion: MotionSolution | None, covariance: FloatArray) -> list[str]:
+    """Why an estimate may be wrong that motion contradicts."""
     if motion is None:
         return []
     step = difference(motion.state, state)[[0, 1, 2, 6]]
@@ -153,7 +154,7 @@ def with_lens_reasons(
     lens are no causes: at a wrong pose some wrong lens always fits better.
 
     Args:
-        of_pose: those of the reasons that say so: :func:`contrast_reasons` and :func:`motion_reasons`.
+        of_pose: those of the reasons that say so (:func:`pose_reasons`).
     """
     return (*reasons, *of_lens) if of_pose else (*of_lens, *reasons)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from sst_graph.batch.by_edges.optimum import RESTARTS, best_optimum_steps, refined_steps, starts_steps
 from sst_graph.batch.by_edges.problem import LabelEstimate, checking_motion, edges_problem, motion_alone
-from sst_graph.batch.by_edges.reasons import edge_contrast_steps, edges_reasons
+from sst_graph.batch.by_edges.reasons import edge_contrast_steps, edges_reasons, pose_reasons
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.errors import EstimationError
 from sst_graph.stepwise import Stepwise
@@ -48,7 +48,8 @@ def first_edge_estimate_steps(
     others = [one.state for _, one in candidates]
     contrast = yield from edge_contrast_steps(problem.subset_edges, state, others, calibration.seed)
     checking = checking_motion(motion, calibration)
-    reasons = edges_reasons(solution, contrast, checking, np.diag(_START_SIGMAS**2), problem.centre)
+    of_pose = pose_reasons(solution.state, contrast, checking, np.diag(_START_SIGMAS**2))
+    reasons = edges_reasons(solution, of_pose, problem.centre)
     names = [name for name, _ in calibration.assumptions.estimated]
     point = Point.of_state(state, calibration.classes, names)
     if stretch.at_end:

@@ -13,7 +13,7 @@ from sst_graph.batch.by_edges.reasons import (
     EdgeContrast,
     contrast_reasons,
     edges_reasons,
-    motion_reasons,
+    pose_reasons,
     with_lens_reasons,
 )
 from sst_graph.graph.state import State
@@ -46,9 +46,9 @@ def test_a_pitch_that_motion_knows_better_is_contradicted(pitch_deg: float, cont
     own = np.diag(np.array([*np.radians([0.16] * 3), 0.02, 0.02, 0.02, 0.004]) ** 2)
     solution: Any = SimpleNamespace(state=truth.moved(step), converged=True)
     right = EdgeContrast(score=500.0, sigmas=12.0, ratio=2.0, other=300.0)
-    reasons = edges_reasons(solution, right, motion, own, truth)
+    of_pose = pose_reasons(solution.state, right, motion, own)
+    reasons = edges_reasons(solution, of_pose, truth)
     assert any("motion alone gives another calibration" in reason for reason in reasons) == contradicts
     # Pictures of the camera beside lead to such a pose, and to a wrong principal point that fits it.
-    of_pose = motion_reasons(solution.state, motion, own)
     first = with_lens_reasons(reasons, LENS, of_pose)[0]
     assert (first in of_pose) == contradicts and (first in LENS) != contradicts
