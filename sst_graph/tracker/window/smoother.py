@@ -377,8 +377,8 @@ class WindowSmoother:
         return sums.shift_excess(window, columns)
 
     def _sums_of_last_epoch(self) -> tuple[RunningSums, list[LinearizedPair], list[IntArray]]:
-        """The sums over all epochs but the last, carried to it by the random walks; the pairs that this one has
-        in the window, and the columns of each in ``past``."""
+        """The sums over all epochs but the last, carried to it by the random walks; the pairs of the
+        window that the last one has, and the columns of each in ``past``."""
         sums, total = self.sums, self.past
         for old, new in pairwise(self.epochs):
             window, columns = self._pairs_of(old)
