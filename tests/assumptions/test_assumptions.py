@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import gtsam
 import numpy as np
@@ -10,12 +12,15 @@ from numpy.typing import NDArray
 
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.assumptions.model import Scene
+from sst_graph.experiments.assumptions import SIZES
+from sst_graph.experiments.wrong_drives import WRONG
 from sst_graph.factors.alignment import Alignment, residuals
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.graph.nuisances import Deviation, residual_columns
 
 FloatArray = NDArray[np.float64]
 
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "understand" / "assumptions.md"
 CAMERA = PinholeCamera(700.0, 720.0, 610.0, 170.0, 1242, 375)
 AXES = gtsam.Rot3(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]))
 cTl = gtsam.Pose3(AXES * gtsam.Rot3.Expmap(np.array([0.01, -0.02, 0.03])), np.array([0.1, -0.3, -0.2]))
@@ -140,6 +145,18 @@ def test_some_of_the_points_keep_the_motion_of_their_image() -> None:
     found = some.effect(points(2), np.zeros(2), np.zeros((2, 2))).twist_shift
     assert found is not None
     np.testing.assert_allclose(found[:, 3:], 0.1 * twists[[3, 1], 3:])
+
+
+@pytest.mark.parametrize("name", ASSUMPTIONS)
+def test_every_assumption_is_in_the_documented_table(name: str) -> None:
+    rows = [line for line in PAGE.read_text(encoding="utf-8").splitlines() if line.startswith("| `")]
+    assert sum(f"`{name}`" in row.split("|")[1] for row in rows) == 1
+
+
+def test_every_assumption_that_matches_test_can_be_broken_on_purpose() -> None:
+    tested = {name for name, assumption in ASSUMPTIONS.items() if assumption.by_matches}
+    assert set(SIZES) == tested
+    assert set(WRONG) == tested - {"line_delay"}  # its pictures are drawn anew
 
 
 @pytest.mark.parametrize("name", ASSUMPTIONS)
