@@ -88,7 +88,8 @@ def solve_with_terms(
 
     Args:
         graph: all other factors, priors on extrinsic and offset among them; none of an earlier solution's.
-        values: start, of all variables.
+        values: start, of all variables. ``FAR_FROM_START`` measures from here, so begin where the graph has
+            its optimum without the terms.
         terms: of one camera.
         config: the schedule.
 
