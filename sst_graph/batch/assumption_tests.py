@@ -57,7 +57,7 @@ _ANOTHER_OPTIMUM = 0.9
 at another optimum. On twelve streets of two seconds it was 0.94 to 1.02 at the same one, and below 0.3 at
 another on two."""
 _MOST_AT_LAST_SCALE = 4
-"""Most further outer iterations of the latter at the last scale."""
+"""Most outer iterations at the last scale of :data:`_NEAR_KERNELS_PX` after it, with one parameter free."""
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,7 @@ KERNELS_PX = (20.0, 20.0, 15.0, 15.0, 10.0, 10.0, 7.0, 7.0, 5.0, 5.0, 4.0, 3.0)
 20 px are 1.6 degrees with KITTI's camera, the error that a start may have; 3 px are more than most errors of
 masks. The other schedules end at the same 3 px: :data:`NARROW_KERNELS_PX` (the batch and the tracker after a
 search, the tracker's whole window), ``kernels_px`` of :class:`sst_graph.batch.part_solver.PartSolver`,
-``_ALL_FREE_KERNELS_PX`` and ``_ONE_FREE_KERNELS_PX`` of :mod:`sst_graph.batch.assumption_tests`,
+``_ALL_FREE_KERNELS_PX`` and ``_NEAR_KERNELS_PX`` of :mod:`sst_graph.batch.assumption_tests`,
 ``_KERNELS_PX`` of :mod:`sst_graph.batch.lower_edges`. New frames in the tracker are matched at the last
 scale."""
 NARROW_KERNELS_PX = KERNELS_PX[6:]
