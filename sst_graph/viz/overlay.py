@@ -87,7 +87,7 @@ def draw_overlay(
     )
     mask_class = _at(image.mask, uvs)[classes == SemanticClass.VEHICLE]
     uvs = (uvs + 0.5) * zoom - 0.5
-    if not _has_labels(scan):
+    if not scan.has_labels:
         _draw_points(picture, uvs, _depth_colours(depths_m), 2)
         return np.vstack([_strip(picture.shape[1], _by_depth(caption)), picture])
     _draw_classes(picture, uvs, classes)
@@ -102,7 +102,7 @@ def draw_overlay(
 
 def legend_of(frames: Sequence[Frame]) -> str:
     """What :func:`draw_overlay` draws of some frames, in sentences."""
-    labelled = [_has_labels(frame.scan) for frame in frames if frame.scan is not None]
+    labelled = [frame.scan.has_labels for frame in frames if frame.scan is not None]
     masks = [frame.image.mask for frame in frames if frame.image is not None]
     outlined = any((mask == SemanticClass.VEHICLE).any() for mask in masks)
     sentences = []
@@ -116,10 +116,6 @@ def legend_of(frames: Sequence[Frame]) -> str:
     if outlined:
         sentences.append("The contour is that of the vehicle mask.")
     return " ".join(sentences)
-
-
-def _has_labels(scan: Scan) -> bool:
-    return bool((scan.classes != SemanticClass.IGNORE).any())
 
 
 def stacked(above: Picture, below: Picture) -> Picture:

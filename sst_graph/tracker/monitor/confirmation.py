@@ -14,7 +14,7 @@ DETECTABLE_TURN_RAD = float(np.radians(0.25))
 """Frames confirm the estimate where a turn of the camera by this about its x or y axis would be past the
 threshold; under the wide kernel a turn of 1 degree looks like this one [rad]."""
 DETECTABLE_OFFSET_S = 0.01
-"""The same of a jump of the clock [s]."""
+"""Frames confirm the time offset where a jump of the clock by this would be past the threshold [s]."""
 _SIGMAS, _MOST = 3.0, 2.0
 """Where an estimate is less sure, a step by so many standard deviations will do: its covariance covers less.
 At most so many times the above: farther away, edges of pictures do not find their matches any more."""
@@ -40,13 +40,8 @@ class Confirmation:
     time_offset_s: float = 0.0
     unreliable: set[int] = field(default_factory=set)
 
-    @property
-    def too_old(self) -> bool:
-        """Whether the estimate is unconfirmed."""
-        return self.too_old_after(0.0)
-
     def too_old_after(self, seconds: float) -> bool:
-        """Whether it is once so much more time has passed."""
+        """Whether the estimate is unconfirmed once so much more time has passed [s]."""
         return self.turn_s + seconds > _MAX_TURN_AGE_S or self.time_offset_s > _MAX_OFFSET_AGE_S
 
     def begin(self) -> None:
