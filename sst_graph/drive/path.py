@@ -16,10 +16,11 @@ _REACH = 2
 """Poses to either side of one that determine the twist there."""
 _NODES = 2 * _REACH + 2
 """Most poses that a polynomial of an interval follows from."""
-_JUDGES = 8
-"""Poses that tell the error between stamps, from two polynomials of one pose less."""
+_ERROR_POSES = 8
+"""Poses from which the error between stamps is estimated: by the distance of two polynomials, through all but
+the first and all but the last of them."""
 _ERROR = 1.5
-"""Error between stamps over the distance of those two: 1.0 for a sine of 2.5 Hz at 10 Hz, 1.5 for one of
+"""Error between stamps over that distance: 1.0 for a sine of 2.5 Hz at 10 Hz, 1.5 for one of
 1.5 Hz, 1.3 to 1.6 where a vehicle brakes and rocks at these rates, 1.5 where rates of turn jump, 2.2 where
 accelerations are white."""
 _MEDIAN_CHI2 = 0.455
@@ -55,7 +56,7 @@ class PathSteps:
 
     @classmethod
     def joined(cls, parts: Sequence[PathSteps]) -> PathSteps:
-        """Those of several paths, one after the other; ``found`` counts through all."""
+        """Steps of several paths, one after the other; ``found`` counts through all."""
         columns = zip(*(vars(part).values() for part in parts), strict=True)
         return cls(*(np.concatenate(column) for column in columns))
 
@@ -164,13 +165,13 @@ class SensorPath:
         intervals = np.flatnonzero(self._ok)
         middles = self._stamps[intervals] + np.diff(self._stamps)[intervals] // 2
         squares, by_noise = self._distances(intervals, middles)
-        told = by_noise > 0.0
-        ratios = squares[told] / by_noise[told, None]
+        known = by_noise > 0.0
+        ratios = squares[known] / by_noise[known, None]
         return np.asarray(np.median(ratios, axis=0) / _MEDIAN_CHI2 if len(ratios) else np.zeros(6))
 
     def _distances(self, intervals: IntArray, stamps_ns: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
-        """(n, 6) squared distances of the two polynomials that tell the error, and (n,) their variance by a
-        unit one of the poses, at times (n,) in intervals (n,).
+        """(n, 6) squared distances of the two polynomials of :data:`_ERROR_POSES`, and (n,) their variance by
+        a unit one of the poses, at times (n,) in intervals (n,).
 
         At an end of the path they are those of the nearest interval that has four poses to either side; 0
         where none has.
@@ -179,18 +180,18 @@ class SensorPath:
             return np.zeros((0, 6)), np.zeros(0)
         differences = [self._difference(i) for i in intervals.tolist()]
         seconds = 1e-9 * (stamps_ns - self._stamps[intervals])
-        powers = (seconds[:, None] ** np.arange(_JUDGES - 1))[:, None]
+        powers = (seconds[:, None] ** np.arange(_ERROR_POSES - 1))[:, None]
         apart = (powers @ np.array([each.coefficients for each in differences]))[:, 0]
         weights = (powers @ np.array([each.inverse for each in differences]))[:, 0]
         return apart**2, (weights**2).sum(axis=1)
 
     def _difference(self, i: int) -> _Polynomial:
-        """The difference of the two polynomials that tell the error in interval i."""
+        """Difference of the two polynomials of :data:`_ERROR_POSES` at interval i."""
         if i not in self._differences:
             begin, end = self._ends(i)
-            half = _JUDGES // 2
-            inverse, coefficients = np.zeros((_JUDGES - 1, _JUDGES)), np.zeros((_JUDGES - 1, 6))
-            if end - begin >= _JUDGES:
+            m, half = _ERROR_POSES, _ERROR_POSES // 2
+            inverse, coefficients = np.zeros((m - 1, m)), np.zeros((m - 1, 6))
+            if end - begin >= m:
                 nearest = min(max(i, begin + half - 1), end - half - 1)
                 times, logs = self._around(nearest, slice(nearest + 1 - half, nearest + 1 + half))
                 inverse = _difference_of_two(times)
