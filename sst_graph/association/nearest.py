@@ -43,7 +43,7 @@ class NearestPixels:
     def at(self, uvs: FloatArray) -> FloatArray:
         """(n, 2) centre of the class's pixel nearest to the pixel that each of uvs (n, 2) lies in [px].
 
-        uvs must lie on the image (see :meth:`sst_graph.factors.PinholeCamera.in_image`).
+        uvs must lie on the image (:meth:`sst_graph.factors.camera.PinholeCamera.in_image`).
         """
         h, w = self.index.shape
         columns, rows = np.minimum((uvs.T + 0.5).astype(np.intp), [[w - 1], [h - 1]])

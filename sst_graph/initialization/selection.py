@@ -222,7 +222,8 @@ def _cTls(poses: Poses) -> list[gtsam.Pose3]:
 
 
 def _centres(poses: Poses, problem: StartProblem) -> Poses:
-    """What the weak priors of each pose are centred on, as :func:`prior_centre` has it."""
+    """What the weak priors of each pose are centred on, as in
+    :func:`sst_graph.initialization.candidates.prior_centre`."""
     offsets, guess = np.full(len(poses), problem.guess.time_offset_s), problem.guess.cTl
     if guess is None:
         return Poses(poses.rotations, np.zeros_like(poses.translations), offsets, poses.biases)

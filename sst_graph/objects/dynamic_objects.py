@@ -223,7 +223,11 @@ class DynamicObjectTest:
 
 
 def find_dynamic_objects(drive: Drive, tracks: Mapping[ObjectId, int]) -> dict[ObjectId, DynamicObject]:
-    """The dynamic objects of all scans of a drive; ``tracks`` are those of :func:`object_tracks`."""
+    """The dynamic objects of all scans of a drive.
+
+    Args:
+        tracks: of :func:`sst_graph.objects.tracks.object_tracks`.
+    """
     by_scan: list[dict[ObjectName, int]] = [{} for _ in drive.scans]
     for (position, c, n), track in tracks.items():
         by_scan[position][c, n] = track

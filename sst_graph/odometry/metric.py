@@ -63,7 +63,7 @@ def metric_motion(
 
     Args:
         tracks: from image a to image b.
-        direction_motion: start of the estimation, see :func:`relative_pose`.
+        direction_motion: start of the estimation, see :func:`sst_graph.odometry.relative.relative_pose`.
         depth_points_c: (m, 3) LiDAR points in camera a at the instant of image a [m].
         camera: intrinsics of both images.
     """

@@ -49,7 +49,7 @@ def write_drive(
     Where the drive tells them, velodyne_times holds each point's time after the stamp (float32 [s]).
 
     Args:
-        drive: from :func:`simulate`.
+        drive: from :func:`sst_graph.simulator.simulate`.
         path: folder to be made.
         progress: called with (frames done, frames in all).
         stereo: write image_3 and semantic_3 as well: the right camera, where calib.txt has it.

@@ -8,7 +8,7 @@ sigma^2, and
     C = P + P (Var(scores) - sum w J J' / sigma^2) P,
 
 the cluster-robust sandwich about the user's own marginal. The variances are fitted to the residuals as those
-of ``calibrate`` (:func:`sst_graph.covariance.cluster_robust.fit_error_model`). They are never below what the
+of ``calibrate`` (:func:`sst_graph.covariance.error_model.fit_error_model`). They are never below what the
 factors claim, for a match, and ``side_sigma_px``, for a side in all images: a short drive shows less than
 there is, for pose and offset are fitted to the same sides.
 
@@ -301,7 +301,8 @@ def _held_biases(
         response = -P @ sums.claimed[:, column]  # of the variables to the bias
         follows = response.copy()
         follows[column] = 1.0
-        # 0 where the graph holds less than the matches: not theirs, or scaled down
+        # The information on the bias; 0 where the graph has less than the matches claim (other factors, or
+        # scaled ones).
         S = max(float(follows @ sums.claimed[:, column]), 0.0) + MASK_BIAS_PRIOR_PX**-2
         # What the variables know beyond these matches (priors, motion) does not err with them.
         sigma = float(np.sqrt(np.maximum(follows @ variance @ follows, 0.0))) / S
