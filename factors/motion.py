@@ -217,7 +217,7 @@ class GroupsMoved:
     Attributes:
         cPs: (3, n) points in the camera at their image's instant [m].
         lift: (g, 13, 6) or (g, 13, 7), that of :class:`RigidlyMoved` for each group.
-        c_velocities: as there.
+        c_velocities: (3, n) of the objects that the points lie on, in the camera [m/s], or None.
     """
 
     cPs: FloatArray
@@ -225,7 +225,7 @@ class GroupsMoved:
     c_velocities: FloatArray | None = None
 
     def write_rows(self, g: FloatArray, out: FloatArray) -> None:
-        """As of :class:`RigidlyMoved`."""
+        """Wrenches into out (6 or 7, k, n), as of :class:`RigidlyMoved`, from the gradients g (3, k, n)."""
         _write_wrenches(self, g, out)
 
 
@@ -420,7 +420,7 @@ def move_groups(
         bounds: (g + 1,) where each group begins, and the end.
         taus_s: (g,) intervals [s].
         motion: its rows are (g, 6), of each group's image.
-        l_velocities: as there.
+        l_velocities: (3, n) as of :func:`move_points` [m/s].
     """
     taus, xis = taus_s[:, None], _group_xis(taus_s, motion)
     poses = [gtsam.Pose3.Expmap(xi) * cTl for xi in xis]
@@ -457,7 +457,7 @@ def transformed(poses: FloatArray, points: FloatArray, bounds: IntArray) -> Floa
 
 
 def rotated(poses: FloatArray, vectors: FloatArray, bounds: IntArray) -> FloatArray:
-    """The same of vectors, which poses only turn."""
+    """(3, n) vectors (3, n) of groups, turned by the pose (g, 4, 4) of each; bounds (g + 1,)."""
     turned = np.empty_like(vectors)
     for R, (a, b) in zip(poses[:, :3, :3], pairwise(bounds.tolist()), strict=True):
         np.matmul(R, vectors[:, a:b], out=turned[:, a:b])

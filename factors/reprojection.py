@@ -172,7 +172,7 @@ class Evaluated:
         return rows if self.lift is None else np.concatenate([self.lift @ rows[:motion], rows[motion:]])
 
     def with_terms(self, coefficients: FloatArray, steps: FloatArray, jacobians: bool) -> Evaluated:
-        """The same with linear terms added to the residuals of silhouettes, before any weighting.
+        """These residuals with linear terms added to the residuals of silhouettes, before any weighting.
 
         Args:
             coefficients: (k, n) derivatives of the residuals by each term's scalar.
@@ -193,7 +193,7 @@ class Evaluated:
         return _motion_rows(self.lift)
 
     def by_group(self, groups: NDArray[np.intp], count: int) -> Evaluated:
-        """The same with a bias column for each of ``count`` groups of matches; groups (n,)."""
+        """These rows with a bias column for each of ``count`` groups of matches; groups (n,)."""
         n = self.rows.shape[2]
         rows = np.zeros((len(self.rows) + count - 1, 1, n))
         rows[: len(self.rows) - 2], rows[-1] = self.rows[:-2], self.rows[-1]
@@ -249,7 +249,7 @@ def evaluate_moved(
     bias_px: float | FloatArray | None,
     jacobians: bool,
 ) -> Evaluated:
-    """The same of points that were moved to their image's instant already."""
+    """:func:`evaluate` of points that were moved to their image's instant already."""
     if bias_px is not None and alignment.normals is None:
         raise FactorError(
             "bias_px", f"{bias_px} for point-to-pixel matches", "None: only silhouettes have a bias"
@@ -287,7 +287,7 @@ class ImageGroups:
 
     @classmethod
     def of(cls, alignment: Alignment, bounds: NDArray[np.intp]) -> ImageGroups:
-        """Those of an alignment whose images begin at ``bounds``."""
+        """The groups of an alignment whose images begin at ``bounds`` (g + 1,)."""
         starts, each = bounds[:-1], np.broadcast_to(alignment.c_acceleration, (len(alignment), 6))
         own = np.column_stack([alignment.base_taus_s, each])
         rigid = np.array_equal(own, np.repeat(own[starts], np.diff(bounds), axis=0))
@@ -349,6 +349,7 @@ def _behind_costs(alignment: Alignment, behind: NDArray[np.bool_]) -> float:
 
 
 def cost(alignment: Alignment, evaluated: Evaluated) -> float:
+    """:func:`alignment_cost` from residuals that were evaluated already; they are not weighted."""
     _, losses = alignment.kernel.weight_and_loss(_squares(alignment, evaluated))
     cost = float(alignment.weights @ losses)
     if evaluated.behind is not None:

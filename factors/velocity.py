@@ -275,7 +275,7 @@ def transferred(
     """The error of :func:`twist_transfer_factor`, of one image or of many.
 
     Args:
-        l_twists, l_accelerations: (..., 6) of the LiDAR, as there.
+        l_twists, l_accelerations: (..., 6) of the LiDAR, as of :class:`LidarTwist` [rad/s, m/s] and [/s].
         since_s: time offset less the one under which they were looked up, one for all or (..., 1) [s].
         c_twists: (..., 6) of the camera.
 

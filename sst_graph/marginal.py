@@ -267,7 +267,7 @@ class Separated:
     errors: Mapping[str, FloatArray]
 
     def carried(self, to: Calibration) -> Separated:
-        """The same about another point."""
+        """Marginal and steps about another point."""
         _, J = _moved(self.own, to)
         return Separated(carried(self.own, to), _steps_there(self.errors, J))
 

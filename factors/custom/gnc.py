@@ -82,7 +82,7 @@ def gnc(
     Args:
         graph: factors with a Gaussian noise model (where they have a Robust one, name them inliers).
         values: start.
-        config: see there.
+        config: cost of an inlier, step of mu, and limits.
         known_inliers: positions of factors that keep the weight 1.
 
     Raises:

@@ -131,7 +131,7 @@ class CalibrationConfig(Settings):
 
     @property
     def estimating(self) -> CalibrationConfig:
-        """The same with a variable in method joint's graph for each assumption that is to be estimated."""
+        """These settings with a variable in method joint's graph for each assumption to be estimated."""
         return replace(self, noise=replace(self.noise, estimate=self.assumptions.estimate))
 
 

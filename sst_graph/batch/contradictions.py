@@ -22,8 +22,8 @@ FALSE_ALARM = 1e-3
 """Probability that any part of a calibration seems to contradict the rest where none does, as far as the
 covariances hold: one false alarm in a thousand calibrations."""
 _SUSPICION = 1e-2
-"""The same for one drive by its stretches alone, before both sides are solved to confirm it: a larger value
-costs only time."""
+"""Probability of a false alarm in one drive by its stretches alone, before both sides are solved to confirm
+it: a larger value costs only time."""
 _MOST_STRETCHES = 8
 """Stretches that a drive is cut into: each costs a solution of its scans."""
 _LEAST_SCANS = 4

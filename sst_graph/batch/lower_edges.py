@@ -93,7 +93,7 @@ class LowerEdgeSupport:
     wide: Mapping[SemanticClass, float] = field(default_factory=dict)
 
     def plus(self, other: LowerEdgeSupport) -> LowerEdgeSupport:
-        """That of these scans and others."""
+        """Support by these scans and others together."""
         return LowerEdgeSupport(_summed(self.narrow, other.narrow), _summed(self.wide, other.wide))
 
     def agreed(

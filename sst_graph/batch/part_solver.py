@@ -101,7 +101,7 @@ class PartSolver:
         return float(self.support(part, state).sum())
 
     def solve_from(self, part: Part, start: State) -> SolvedPart | None:
-        """The same from a start that is nearly right."""
+        """A part solved by itself from a start that is nearly right; None where it has no estimate."""
         return self._solved(part, start, self.kernels_px[len(self.kernels_px) // 2 :])
 
     def estimates(self, found: SolvedPart, start: State) -> tuple[SolvedPart, ...]:

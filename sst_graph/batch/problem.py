@@ -143,7 +143,7 @@ class MatchedDrives:
     state: State
 
     def started_at(self, guess: Guess) -> MatchedDrives:
-        """The same beside another start."""
+        """These drives, whose fit is compared with that of another start."""
         return replace(self, problem=replace(self.problem, guess=guess))
 
     def fit_at(self, at: Calibration) -> Fit | None:

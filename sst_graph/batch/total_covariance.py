@@ -50,7 +50,7 @@ class TotalCovariance:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """That pictures shift and stamps jitter, where it matters."""
+        """Sentences that say that pictures shift, or stamps jitter; none where it does not matter."""
         return self.shifts.sentences(self.covariance)
 
 

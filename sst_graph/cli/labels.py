@@ -28,7 +28,7 @@ ALIGNABLE = tuple(
 )
 """Classes that ``--classes`` takes."""
 _OF_OBJECTS = tuple(label for label in ALIGNABLE if label not in WITHOUT_EDGES)
-"""Those that stand before something else, and so have edges in a scan."""
+"""Classes of objects: they stand before something else, and so have edges in a scan."""
 _FIRST = 8
 """Scans, or images, that are looked at before all others."""
 

@@ -39,7 +39,7 @@ class Settings:
             raise self._outside(name, f"at most {bound:.10g}", why)
 
     def expect_at_least(self, name: str, bound: float, why: str) -> None:
-        """The same for a field below a bound."""
+        """A rule between fields: raise where the field ``name`` is below a bound, which ``why`` explains."""
         if getattr(self, name) < bound:
             raise self._outside(name, f"at least {bound:.10g}", why)
 

@@ -101,7 +101,7 @@ class AssumptionConfig(AssumptionSigmas):
 
     @property
     def misleading_motion(self) -> tuple[str, ...]:
-        """Those of the estimated parameters that mislead the calibration by motion alone."""
+        """Names of the estimated parameters that mislead the calibration by motion alone."""
         return tuple(name for name, _ in self.estimated if ASSUMPTIONS[name].misleads_motion)
 
 

@@ -73,7 +73,7 @@ class SideResiduals:
 
     @classmethod
     def joined(cls, parts: Sequence[SideResiduals]) -> SideResiduals:
-        """Those of different frames."""
+        """Residuals of the sides in several frames as one."""
         names = ("sides", "means", "weights", "weights2", "within")
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 

@@ -71,8 +71,8 @@ class ImageShifts:
         }
 
     def sentences(self, covariance: FloatArray) -> tuple[str, ...]:
-        """That the pictures shift, and that their stamps jitter, where it makes up much of a covariance
-        (7, 7)."""
+        """Sentences that say that the pictures shift, or that their stamps jitter; none where it makes up
+        little of a covariance (7, 7)."""
         of_picture, of_stamp = (
             np.sqrt(np.diag(part)[:7] / np.diag(covariance)).max() > MATTERS
             for part in (self.parts[:2].sum(axis=0), self.parts[2])

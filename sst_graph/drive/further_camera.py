@@ -134,7 +134,7 @@ def _scan_numbers(drive: Drive, source: Source) -> list[int]:
 def _statistics(
     drive: Drive, scans: Sequence[ScanFeatures], of_images: InputStatistics
 ) -> InputStatistics | None:
-    """Those of the drive's scans, by the other source's numbers, and of the other camera's images."""
+    """Statistics of the drive's scans, by the other source's numbers, and of the other camera's images."""
     if drive.statistics is None:
         return None
     number = {old.index: new.index for old, new in zip(drive.scans, scans, strict=True)}

@@ -112,7 +112,7 @@ class ScanFeatures:
     by_geometry: ScanFeatures | None = None
 
     def stored_in(self, store: ArrayStore) -> ScanFeatures:
-        """The same with its points in an array store, the sample in the precision of the scan's."""
+        """The scan with its points in an array store, the sample in the precision of the scan's."""
         boundaries, lower_edges = (
             {c: points.stored_in(store) for c, points in found.items()}
             for found in (self.boundaries, self.lower_edges)
@@ -147,7 +147,7 @@ class ImageFeatures:
     contours: dict[SemanticClass, ContourMap | PictureGradients]
 
     def stored_in(self, store: ArrayStore) -> ImageFeatures:
-        """The same with mask and distances in an array store."""
+        """The image with mask and distances in an array store."""
         contours = {c: contour.stored_in(store) for c, contour in self.contours.items()}
         return replace(self, mask=store.put(self.mask), contours=contours)
 

@@ -131,7 +131,7 @@ class GrowingTwists:
         self._zero_velocity, self._smoother = ZeroVelocityUpdate(), MotionSmoother(reach)
 
     def of(self, motions: Sequence[RelativeMotion]) -> SensorTwists | None:
-        """Those by consecutive motions; None without any. Motions of the call before are recognised by
+        """Twists by consecutive motions; None without any. Motions of the call before are recognised by
         identity."""
         return SensorTwists(self._smoother.smoothed(self._zero_velocity.apply(motions))) if motions else None
 

@@ -166,7 +166,7 @@ def _around(rotations: FloatArray, step_deg: float) -> FloatArray:
 
 
 def _gated(rotations: FloatArray, region: SearchRegion) -> FloatArray:
-    """Those that motion's rotation does not contradict; all, where it contradicts all."""
+    """Rotations (k, 3, 3) that motion's rotation does not contradict; all, where it contradicts all."""
     if region.motion is None:
         return rotations
     allowed = region.motion.chi2(rotations) < _GATE_CHI2

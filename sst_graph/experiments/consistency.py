@@ -71,7 +71,7 @@ class ConsistencyRun:
     offset_observable: bool = True
 
     def judged(self, part: slice) -> slice:
-        """Those of some of the seven that the drive determines."""
+        """The unknowns of a part of the seven that the drive determines."""
         return slice(part.start, part.stop if self.offset_observable else min(part.stop, 6))
 
     def nees(self, part: slice) -> float:

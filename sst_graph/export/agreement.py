@@ -28,7 +28,7 @@ def check_agreement(
     names: Sequence[str] = (),
     significance: float = SIGNIFICANCE,
 ) -> None:
-    """That marginals about one point agree, each with the others and all together.
+    """Refuse marginals about one point that do not agree, each with the others and all together.
 
     Args:
         parts: the marginals; what they have in common explains differences between them only as far as it
@@ -62,7 +62,7 @@ def check_agreement(
 
 
 def check_apart(marginals: Sequence[CalibrationMarginal], names: Sequence[str] = ()) -> None:
-    """That no two are of the same scans, which counted twice make the fused result too sure.
+    """Refuse two that are of the same scans, which counted twice make the fused result too sure.
 
     Two are where they have scans in common, or where their numbers are the same to the last bit.
 
@@ -84,7 +84,7 @@ def check_apart(marginals: Sequence[CalibrationMarginal], names: Sequence[str] =
 
 
 def _check_answers(informations: Sequence[FloatArray], names: Sequence[str]) -> None:
-    """That each is an estimate of its own, and no difference of two as a growing marginal's parts are."""
+    """Refuse what is no estimate of its own but a difference of two, as a growing marginal's parts are."""
     scale = unit_scale(np.sum(informations, axis=0))
     for k, information in enumerate(informations):
         least = float(np.linalg.eigvalsh(information * np.outer(scale, scale))[0])

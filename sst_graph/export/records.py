@@ -40,7 +40,7 @@ def kitti(rig: Rig) -> str:
     else:
         camera = result.camera_name.removeprefix("image_").lstrip("0") or "0"
         own = int(camera) if re.fullmatch(r"\d", camera) else 0
-        # One camera is known, and stands for all: pykitti wants four.
+        # pykitti expects P0 to P3; all get the one camera that is known.
         P = np.hstack([lens.matrix, np.zeros((3, 1))])
         projections = dict.fromkeys(sorted({0, 1, 2, 3, own}), P)
         c0Tl = result.T_camera_lidar

@@ -26,8 +26,8 @@ from sst_graph.types import FloatArray, IntArray, Scan, SemanticClass
 _BEHIND_M = 0.5
 """The neighbour has to be farther by this much: less is the object's own relief [m]."""
 _JUMP_M = 0.25
-"""The same on objects without a class, of which every near side of a jump counts, on the object's own parts
-too [m]."""
+"""In place of :data:`_BEHIND_M` on objects without a class: every near side of a jump counts, on the object's
+own parts too [m]."""
 _OUTLINE_M = 1.0
 """Upper edges of objects without a class are shallow where the ring above returns from less than this behind:
 a bonnet, a rear window or a hedge may go on there [m]."""
@@ -93,7 +93,7 @@ class Boundaries:
         return shape_of(self, "lPs")[0]
 
     def stored_in(self, store: ArrayStore) -> Boundaries:
-        """The same with its points in an array store."""
+        """The boundaries with their points in an array store."""
         return Boundaries(*map(store.put, self._rows()))
 
     def joined(self, other: Boundaries) -> Boundaries:

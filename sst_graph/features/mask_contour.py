@@ -127,7 +127,7 @@ class ContourMap:
         return columns, rows
 
     def stored_in(self, store: ArrayStore) -> ContourMap:
-        """The same with its fields in an array store."""
+        """The map with its fields in an array store."""
         return replace(self, distance=store.put(self.distance), unknown=store.put(self.unknown))
 
     def look_up(self, uvs: FloatArray) -> ContourFeet:
@@ -228,7 +228,8 @@ def signed_distance(inside: NDArray[np.uint8]) -> FloatMap:
     """
     distance = np.asarray(cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_5), np.float32)
     distance -= 0.5
-    # The nearest pixel outside touches the same part of the region: each stretch of columns on its own.
+    # Distances inside, one run of occupied columns after the other: the nearest pixel outside lies beside the
+    # same run.
     occupied = np.concatenate([[False], inside.any(axis=0), [False]])
     for start, end in np.flatnonzero(occupied[1:] != occupied[:-1]).reshape(-1, 2).tolist():
         left = max(0, start - 1)

@@ -26,8 +26,8 @@ EdgePlace = Literal["centre", "peak", "strongest"]
 method, or the place of the greatest strength."""
 
 DIRECTIONS = 8
-"""Directions of which strengths are kept, evenly over half a turn: a ninth of a right angle off, an edge has
-98 % of its strength."""
+"""Directions of which strengths are kept, evenly over half a turn: an edge half way between two of them, 11
+deg off, still has 98 % of its strength."""
 _BLUR_PX = 1.0
 """Gaussian blur of the picture before differences are taken [px]."""
 _AROUND_PX = 40
@@ -100,14 +100,14 @@ class PictureGradients:
         return cls(np.concatenate(strengths), np.concatenate(usual), width, height)
 
     def stored_in(self, store: ArrayStore) -> PictureGradients:
-        """The same with its fields in an array store."""
+        """The gradients with their fields in an array store."""
         return replace(self, strengths=store.put(self.strengths), usual=store.put(self.usual))
 
     def blurred(self, sigma_px: float, every: int) -> FloatMap:
         """(DIRECTIONS, h / every, w / every) strengths above the usual, blurred, of every so many pixels;
         both sizes rounded up."""
         width, height = -(-self.width // every), -(-self.height // every)
-        # A whole number of pixels in each: they are where they belong, and counted ten times as fast.
+        # Padded to whole cells: no pixel is shared by two, and the means are ten times as fast.
         border = (0, height * every - self.height, 0, width * every - self.width)
         fields = []
         for strength, mean in zip(
@@ -159,14 +159,15 @@ def profiles(
     distances, (u, v) = ts.astype(np.float32)[:, None], uvs.T.astype(np.float32)
     across, down = outward.T.astype(np.float32)
     u, v = u + distances * across, v + distances * down
-    # To the sides the picture's border goes on; above and below lie other directions.
+    # The fields of the directions stand one below the other: rows are kept within their own field. Columns
+    # need no limit, the border is repeated there.
     np.maximum(v, np.float32(0.0), out=v)
     np.minimum(v, (height - 1).astype(np.float32), out=v)
     v += (number * height).astype(np.float32)
     column, row = np.maximum((uvs / 4.0).astype(np.intp).T, 0)
     columns, rows = -(-width // 4), -(-height // 4)
     places = (np.minimum(row, rows - 1) + number * rows) * columns + np.minimum(column, columns - 1)
-    # 2. Look.
+    # 2. Strengths there, less what is usual nearby.
     for each, (a, b) in zip(gradients, spans, strict=True):
         if b > a:
             found[:, a:b] = sampled(each.strengths, u[:, a:b], v[:, a:b])

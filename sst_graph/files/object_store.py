@@ -278,7 +278,7 @@ def _laid_out(value: Any, part: Callable[[Any], Any]) -> Any:
     elif kind == "object" and class_name(type(value)).startswith(_PACKAGES):
         attributes = vars(value) if hasattr(value, "__dict__") else {}
         for name, one in _state(value).items():
-            # What is stored otherwise than it is kept is made again when it is read.
+            # Only attributes that are stored as they are: others are derived again when the object is read.
             if attributes.get(name) is one and part(one) is not one:
                 object.__setattr__(value, name, part(one))
     return value
@@ -515,7 +515,7 @@ class _Reader:
         points = self.value(node)
         if not (isinstance(points, np.ndarray) and points.ndim == 2 and np.isfinite(points).all()):
             raise ValueError("a tree of what are no finite points")
-        # What is found does not depend on its shape.
+        # A query's answer does not depend on how the tree is balanced.
         return self._keep(number, cKDTree(points, balanced_tree=False, compact_nodes=False))
 
     def _object(self, name: str, node: Node, number: int) -> Any:

@@ -257,7 +257,7 @@ def _link_free(source: Path, target: Path) -> bool:
     except OSError as error:
         if error.errno not in _NO_LINKS:
             raise
-        # Without hard links nothing can be both certain and whole; the gap is microseconds.
+        # Without hard links a file may be replaced that comes between check and rename, within microseconds.
         if os.path.lexists(target):
             return False
         os.rename(source, target)

@@ -103,7 +103,7 @@ class Place:
         return list(self.entries())
 
     def entries(self) -> dict[Place, bool]:
-        """The same, and whether each is a folder.
+        """What :meth:`below` lists, and whether each is a folder.
 
         Raises:
             DataError: no folder, or it cannot be listed.

@@ -19,7 +19,7 @@ _PREFIX = "sst-graph-batch-"
 def scratch_folder() -> Iterator[Path]:
     """A folder of this process alone, removed with all it holds when the block ends."""
     root = Path(tempfile.gettempdir())
-    # Locked under a name that no sweep looks at, then given the one that it is known by.
+    # Locked under a hidden name, which no clean-up looks at, then renamed.
     hidden = root / f".{_PREFIX}{secrets.token_hex(8)}"
     hidden.mkdir(mode=0o700)
     descriptor = os.open(hidden, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)

@@ -44,7 +44,7 @@ class DriveMotion:
     def with_objects(
         self, objects: Mapping[ObjectId, int], dynamic: Mapping[ObjectId, DynamicObject]
     ) -> DriveMotion:
-        """The same with these tracks of objects and these dynamic ones."""
+        """The motion with these tracks of objects and these dynamic ones."""
         by_scan: dict[int, DynamicObjects] = {}
         for (scan, c, n), one in dynamic.items():
             by_scan.setdefault(scan, {})[c, n] = one

@@ -35,7 +35,7 @@ class KnownCalibration:
         return np.asarray(np.linalg.inv(self.covariance), np.float64)
 
     def with_share(self, share: float) -> KnownCalibration:
-        """The same with a share of its information."""
+        """What is known, with a share of its information."""
         return replace(self, covariance=self.covariance / share)
 
     def columns(self, names: Sequence[str]) -> FloatArray:

@@ -488,7 +488,7 @@ class DriveMatches:
 
     @property
     def classes(self) -> list[SemanticClass]:
-        """Those that have matches."""
+        """Classes that have matches."""
         present = {c for c, count in zip(self.group_classes, self.counts.tolist(), strict=True) if count}
         return sorted(present)
 
@@ -515,7 +515,7 @@ class DriveMatches:
         return residual_columns(self.alignment, scene, base_taus_s, at, names)
 
     def by_pair(self) -> list[PairMatches]:
-        """The same pair by pair, of those that have matches."""
+        """The matches of each pair that has some."""
         groups: dict[int, dict[SemanticClass, tuple[slice, int]]] = {}
         spans = pairwise(self.found.bounds.tolist())
         for p, c, (a, b), seen in zip(

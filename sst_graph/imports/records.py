@@ -147,7 +147,7 @@ def read_nuscenes(document: Document, options: ImportOptions) -> Found:
 
 
 def _named_lidar(records: list[Any], channel: str | None, document: Document) -> list[Any]:
-    """Those of a channel; all without one."""
+    """Records of a channel; all without one."""
     named = [record for record in records if channel in (None, _channel(record))]
     if records and not named:
         listed = ", ".join(map(_channel, records[:12]))

@@ -312,7 +312,7 @@ def _peaks(states: States, scores: FloatArray, count: int, apart_rad: float) -> 
     order = np.argsort(-scores, kind="stable")
     flat = states.rotations.reshape(len(scores), 9)
     largest_trace = 1.0 + 2.0 * np.cos(apart_rad)
-    # Some at a time, for the best are mostly enough.
+    # In batches from the best down: the first one mostly has enough.
     for start in range(0, len(order), _PEAKS_AT_ONCE):
         remaining = order[start : start + _PEAKS_AT_ONCE]
         near = flat[remaining] @ flat[chosen].T >= largest_trace

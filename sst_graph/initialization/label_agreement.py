@@ -31,8 +31,8 @@ _WRONG_LABELS = 0.1
 _STEP_POINTS = 400_000
 """Points, times poses, that are projected in a step."""
 _BATCH_POINTS = 100_000
-"""The same at once: arrays fit into a core's cache, and products are small enough that BLAS, where it may use
-several threads, takes one. Both make a step several times faster."""
+"""Points, times poses, that are projected at once: arrays fit into a core's cache, and products are small
+enough that BLAS, where it may use several threads, takes one. Both make a step several times faster."""
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ class RefinementProblem:
         return cls([PoseBatch(own) for own in edges], config)
 
     def thinned(self, points: int) -> RefinementProblem:
-        """The same with about so many boundary points in all."""
+        """The problem with about so many boundary points in all."""
         total = max(1, sum(map(len, self._batches)))
         batches = [batch.thinned(max(1, points * len(batch) // total)) for batch in self._batches]
         return RefinementProblem(batches, self.config)

@@ -41,7 +41,7 @@ def budget_rows(result: CalibrationResult) -> list[tuple[str, str, str, str]]:
 
 
 def budget_lines(result: CalibrationResult) -> list[str]:
-    """The same as lines of text under a head."""
+    """:func:`budget_rows` as lines of text under a head."""
     rows = budget_rows(result)
     head = "where the sigmas come from (largest axis)     rotation  translation  time offset"
     lines = [f"  {label:<44}{turn:>11} {shift:>11} {offset:>12}" for label, turn, shift, offset in rows]

@@ -298,7 +298,7 @@ def _such(count: int) -> str:
 
 
 def _differing(one: Prediction, other: Prediction, axes: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Those of the unknowns whose sigmas are not the same after rounding."""
+    """Axes of the unknowns whose sigmas are not the same after rounding."""
     a, b = _sigmas(one.sigmas), _sigmas(other.sigmas)
     return np.array([i for i in axes if short(a[i]) != short(b[i])], np.intp)
 

@@ -61,7 +61,7 @@ def quality_line(quality: FitQuality, with_attainable: bool = True) -> str:
         with_attainable: whether to say what such labels allow.
     """
     by_labels = quality.by_chance is None
-    # What edges allow falls with the calibration itself: it would not tell one that is wrong.
+    # For edges the attainable share is not said: a wrong calibration lowers it as well.
     compared = by_labels and with_attainable
     others = {"at the start": quality.share_at_start, "at random rotations": quality.by_chance}
     shares = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in others.items() if share is not None)
@@ -78,7 +78,7 @@ def fit_line(result: CalibrationResult) -> str:
     quality = FitQuality.from_diagnostics(result.diagnostics)
     if quality is None:
         return edges_line(result)
-    # A wrong calibration meets few contours, and those by chance: what they allow is met as well.
+    # Nor for a calibration that may be wrong: it meets few contours, by chance, and so attains its share.
     compared = result.status != "not_converged"
     of_edges = FitQuality.from_diagnostics(result.diagnostics, EDGES_QUALITY)
     if of_edges is not None:
@@ -88,7 +88,8 @@ def fit_line(result: CalibrationResult) -> str:
         return f"{CHECK_BY_EDGES}: {quality_line(quality)}{_over_chance(quality)}"
     contrast = "" if quality.by_chance is None else edges_line(result)
     shares = quality_line(quality, compared)
-    # Many a point's strongest edge is another one: only the score has a limit that right ones keep.
+    # The strongest edge near a point is often another object's, so the share says little: only the score has
+    # a limit that right calibrations keep.
     return f"{contrast}; no measure by itself: {shares}" if contrast else shares
 
 
@@ -123,7 +124,7 @@ def edges_line(result: CalibrationResult) -> str:
 def _known(result: CalibrationResult) -> str:
     degrees, cm, ms = largest_sigmas(result)
     one = misfit_at(result, MIDDLE_M)
-    # Of a calibration that is open by degrees the corners say nothing more.
+    # The corners are worth a line only where the result is ok: with sigmas of degrees they add nothing.
     worth_saying = one.more_in_corners and result.status == "ok"
     lens = "where the lens counts, " if one.lens_counts else ""
     corners = f"; in the corners, {lens}{figure(one.corner_px)} px" if worth_saying else ""

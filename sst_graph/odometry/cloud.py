@@ -34,7 +34,7 @@ def compensate_sweep(points: FloatArray, offsets_s: FloatArray, twist: FloatArra
 
 
 FEWEST_POINTS = 11
-"""That small_gicp registers without a warning of its own on stderr."""
+"""Fewest points of a cloud: with fewer, small_gicp prints a warning of its own on stderr."""
 
 
 def usable_points(

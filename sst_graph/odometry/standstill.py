@@ -74,7 +74,7 @@ class ZeroVelocityUpdate:
 
     def apply(self, motions: Sequence[RelativeMotion]) -> list[RelativeMotion]:
         """As :func:`zero_velocity_update`; motions of the call before are recognised by identity."""
-        # A motion's neighbours decide, as far as motions are tested together, and a stop at the least.
+        # A new motion changes decisions as far back as motions are tested together, plus the shortest stop.
         reach = MAX_MOTIONS_TOGETHER + _MIN_MOTIONS
         first, alike = overlap(self._motions, motions)
         known = self._updated[first : first + max(0, alike - reach)]

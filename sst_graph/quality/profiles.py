@@ -19,7 +19,7 @@ from sst_graph.types import Calibration, FloatArray
 _STEPS = (1.0, 2.0, 3.0, 4.0)
 """How far a profile goes to either side, in standard deviations."""
 _FEW_STEPS = (2.0, 4.0)
-"""The same of large problems, so that profiles take a few seconds at most."""
+"""Steps of profiles of large problems, so that these take a few seconds at most."""
 _SCORE_STEPS = (0.5, 1.0, 2.0, 3.0)
 """How far a profile by the score goes to either side, in standard deviations."""
 _SCORE_BLUR_PX = 1.5

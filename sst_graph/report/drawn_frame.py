@@ -31,7 +31,7 @@ class DrawnFrame:
     camera: PinholeCamera
 
     def through(self, camera: PinholeCamera) -> DrawnFrame:
-        """The same, its points projected by another camera of the same pictures."""
+        """The frame with its points projected by another camera of the same pictures."""
         same = (camera.width, camera.height) == (self.camera.width, self.camera.height)
         return replace(self, camera=camera) if same else self
 

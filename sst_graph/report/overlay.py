@@ -1,4 +1,4 @@
-"""The same picture before and after, as data that the page's script draws."""
+"""A picture with the cloud before and after the calibration, as data that the page's script draws."""
 
 from __future__ import annotations
 

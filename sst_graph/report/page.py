@@ -96,7 +96,7 @@ _DRAG = (
 PICTURES = 3
 """Pictures with the cloud, over all drives."""
 PICTURES_OF_EACH = 2
-"""The same of labels and of edges, where a result has both."""
+"""Pictures by labels, and as many by edges, where a result has both."""
 
 
 @dataclass(frozen=True)

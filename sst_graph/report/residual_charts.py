@@ -29,7 +29,7 @@ _MOST_PX = 6.0
 
 
 def residual_charts(fit: Fit) -> list[str]:
-    """Those that stand beside each other, as figures."""
+    """Charts that stand beside each other, as figures."""
     points = fit.points
     return [
         _histogram(fit),
@@ -48,7 +48,7 @@ def residual_charts(fit: Fit) -> list[str]:
 
 
 def broad_charts(fit: Fit, camera: PinholeCamera) -> list[str]:
-    """Those that are as wide as the page, as figures."""
+    """Charts that are as wide as the page, as figures."""
     return [_by_object(fit), _over_picture(fit, camera)]
 
 

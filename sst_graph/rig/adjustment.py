@@ -161,4 +161,4 @@ def _freedom(step: FloatArray, covariance: FloatArray, estimated: FloatArray, cl
 
 
 _LEAST_FREEDOM = 4.0
-"""As of the differences between drives: part of the covariance is the error model's."""
+"""Least degrees of freedom, as of differences between drives: part of the covariance is the error model's."""

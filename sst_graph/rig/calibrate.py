@@ -213,7 +213,7 @@ class _Camera:
 
     @property
     def open_sweeps(self) -> tuple[str, ...]:
-        """That nothing decides a sweep and that it matters: an error that all cameras share."""
+        """Sentences on sweeps that nothing decides and that matter: an error that all cameras share."""
         return () if self.estimate is None else self.estimate.open_sweeps
 
     @cached_property

@@ -46,7 +46,7 @@ class SensorRecord:
 
     @property
     def missing(self) -> str:
-        """That there was no message, and why, where that is known."""
+        """A sentence that says that there was no message, and why, where that is known."""
         why = ""
         if self.published is not None and self.type_name not in self.published:
             why = ": nothing publishes it"

@@ -135,7 +135,7 @@ def _session(runtime: Any, path: Path, options: Any) -> Any:
     refusal: Exception | None = None
     for providers in (every, ["CPUExecutionProvider"]):
         try:
-            # Its own fallback tells of it on stdout.
+            # Not with the runtime's own fallback, which prints on stdout.
             return runtime.InferenceSession(str(path), options, providers=providers, enable_fallback=0)
         except Exception as error:  # its exceptions share no other base
             refusal = refusal or error

@@ -157,7 +157,7 @@ class _Beam:
 
 
 def _not_above(triangles: FloatArray, slopes: FloatArray) -> IndexArray:
-    """Those of the triangles (n, 3, 3) that are not wholly above all rings."""
+    """Which of the triangles (n, 3, 3) are not wholly above all rings."""
     bottom = _of_three(np.minimum, triangles[:, :, 2])
     far = _of_three(np.maximum, np.hypot(triangles[:, :, 0], triangles[:, :, 1]))
     # A little less strict than the quotient of :func:`_within_rings`, which decides.

@@ -103,7 +103,7 @@ class TrackerConfig(Settings):
 
     @property
     def estimating(self) -> TrackerConfig:
-        """The same with a variable in the graph for each assumption that is to be estimated, and with objects
+        """These settings with a variable in the graph for each assumption to be estimated, and with objects
         without a class among the classes where edges are aligned."""
         calibration = self.calibration.estimating
         calibration = replace(calibration, classes=prepared_classes(calibration))

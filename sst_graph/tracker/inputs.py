@@ -37,7 +37,7 @@ _ELSEWHERE = 5
 _MAX_IMAGES = 600
 """Most images that are kept, for any number of them may come while no scan does: a minute at 10 Hz."""
 _MAX_EDGE_IMAGES = 100
-"""The same where edges are aligned: the gradients of a picture take 8.5 bytes a pixel."""
+"""Most images that are kept where edges are aligned: the gradients of a picture take 8.5 bytes a pixel."""
 _MAX_FAILURES = 10
 """Failures in a row after which the window is given up: it is then their likely cause."""
 _MOVED_M, _FASTEST_STOP_MPS = 0.05, 2.0

@@ -25,7 +25,7 @@ class Uncertainty:
 
     Attributes:
         joint: cluster-robust covariance of all unknowns, with what shifts of pictures and stamps add.
-        inflation: how much larger the former is than that of independent matches.
+        inflation: how much larger the cluster-robust covariance is than that of independent matches.
         by_static_objects: (7, 7) covariance of extrinsic and offset by static objects alone; None where no
             object moves.
         steps: (7,) derivative of extrinsic and offset by each parameter of an assumption that is held at 0,

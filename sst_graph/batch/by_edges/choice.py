@@ -54,8 +54,8 @@ def with_method_for_cameras(
 def choice_for_cameras(
     config: CalibrationConfig, cameras: Sequence[Sequence[Source]]
 ) -> tuple[CalibrationConfig, list[int]]:
-    """The same, and the positions of the cameras for which method auto takes edges in the place of labels: a
-    drive of theirs has pictures and no labels.
+    """:func:`with_method_for_cameras`, and the positions of the cameras for which method auto takes edges in
+    the place of labels: a drive of theirs has pictures and no labels.
 
     Raises:
         DataError: a frame cannot be read.
@@ -72,7 +72,7 @@ def choice_for_cameras(
 
 
 def with_method_of(config: CalibrationConfig, drives: Sequence[Drive]) -> CalibrationConfig:
-    """The same, by what drives were prepared for."""
+    """The settings with the method that drives were prepared for, where the method is auto."""
     if config.method != "auto":
         return config
     if not has_edges(drives):

@@ -78,7 +78,7 @@ class LensTest:
 
     @property
     def contradicted(self) -> tuple[ParameterTest, ...]:
-        """Those that the data contradict."""
+        """Findings of the parameters that the data contradict."""
         return tuple(finding for finding in self.findings if finding.contradicted)
 
     @property
@@ -134,8 +134,8 @@ def lens_steps(
     if not config.test or not names:
         return LensTest()
     free, start = edges.whole.estimating(names), state.with_parameters(names)
-    # Soft matches follow a wrong lens for many steps. What moves by a fifth of a sigma after the first ones
-    # decides nothing where others test the same.
+    # Soft matches follow a wrong lens for many steps. Beside other tests of the same parameters the first
+    # steps are enough: the later ones move the parameters by a fifth of a sigma.
     few = replace(free, config=replace(free.config, max_outer=len(START_KERNELS_PX)))
     try:
         wide = yield from solution_steps(free if beside is None else few, start, START_KERNELS_PX)
@@ -145,7 +145,8 @@ def lens_steps(
             found = yield from _near(free, start)
     except EstimationError:
         return LensTest()
-    # Half of the objects, and half of what else is known: but for chance, their optimum is that of the whole.
+    # Half-samples of the objects get half of the prior's information, so that their optimum differs from that
+    # of the whole by chance alone.
     halves = replace(free, prior=edges.known.with_share(0.5))
 
     def settled(steps: Mapping[str, FloatArray]) -> bool:

@@ -38,7 +38,7 @@ _FLOOR = np.array([*np.radians([0.1] * 3), 0.005])
 knows them to 0.1 deg. The two differ by up to 0.11 deg on the KITTI drives; a false optimum in a forest lies
 1.2 deg away from motion."""
 _FLOOR_OF_MISFIT = np.array([*np.radians([0.5] * 3), 0.005])
-"""The same for a motion that does not fit itself, whose covariance says less."""
+"""In place of :data:`_FLOOR` for a motion that does not fit itself, whose covariance says less [rad, s]."""
 _SETTLED_STEP = np.array([*np.radians([0.1] * 3), 0.025, 0.025, 0.025, 0.015])
 """(7,) farther apart, two solutions are not one optimum [rad, m, s]: right ones came back to within 0.01 deg,
 a false one ended 0.4 deg away."""

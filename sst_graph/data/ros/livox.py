@@ -21,7 +21,7 @@ from sst_graph.errors import DataError, count_of
 
 CUSTOM = "livox_ros_driver2/msg/CustomMsg"
 OLDER_CUSTOM = ("livox_ros_driver/msg/CustomMsg", "livox_interfaces/msg/CustomMsg")
-"""The same message under the names that other drivers give it."""
+"""Types of other drivers with the fields of :data:`CUSTOM`."""
 
 _NAMES = ("offset_time", "x", "y", "z", "reflectivity", "tag", "line")
 _FORMATS = ("u4", "f4", "f4", "f4", "u1", "u1", "u1")

@@ -40,7 +40,7 @@ class Transforms:
             self._moving.add(edge)
 
     def joined(self, other: Transforms) -> Transforms:
-        """These and the transforms of another file."""
+        """The transforms of this file and of another one."""
         both = Transforms()
         for one in (self, other):
             for (parent, child), pose in one._poses.items():
@@ -105,7 +105,7 @@ class Transforms:
         return pose, f"by transforms {' - '.join(path)}"
 
     def _without(self, children: Collection[str]) -> Transforms:
-        """These but for the poses of some frames."""
+        """All transforms but the poses of some frames."""
         kept = Transforms()
         kept._poses = {edge: pose for edge, pose in self._poses.items() if edge[1] not in children}
         kept._moving = {edge for edge in self._moving if edge in kept._poses}

@@ -19,7 +19,7 @@ def code_version() -> str:
 
 
 def recorded_version() -> str:
-    """The same, told apart also from other changes to one commit (of files that git follows)."""
+    """:func:`code_version`, and where it is ``-dirty`` a hash of the changes to files that git follows."""
     version = code_version()
     if not version.endswith(_DIRTY):
         return version

@@ -61,7 +61,7 @@ def counts_line(rows: Sequence[Row]) -> str:
 
 
 def others_line(others: int) -> str:
-    """That results of drives that were not given this time count for nothing."""
+    """A sentence that says that results of drives which were not given this time count for nothing."""
     them = _verb(others, "it is", "they are")
     return (
         f"{count_of(others, 'drive')} of earlier runs {_verb(others, 'was', 'were')} not given this time: "

@@ -152,7 +152,7 @@ class SweepDecision:
         return self.as_given(contradiction)
 
     def as_given(self, contradiction: str) -> SweepDecision:
-        """That times are given, which hold, and how the scans contradict them, or nothing."""
+        """The decision where the data give times, which hold; how the scans contradict them, or nothing."""
         return replace(self, kind="given", timing=AT_ONCE, others=(), contradiction=contradiction)
 
     def to_dict(self) -> dict[str, Any]:
@@ -328,15 +328,16 @@ def _compare_hypotheses(
     behind = {name: means[best] - means[name] for name in means}
     needed = -np.log(_ERROR_RATE)
     excluded = {name for name in behind if behind[name] > needed}
-    # By the registration itself: bounded evidence forgives a start beside the right one the points between.
+    # The start of the turn by the cost of the registration, which is not bounded: under the bounded evidence
+    # the few points between a wrong start and the right one would hardly count.
     starts = {name: _start(found.quadratic.cost(f), evidence.unit) for name, f in FRACTIONS.items()}
     # Compensated points are compared with the turn that fits best.
     raw = best if best != "compensated" else min(_RAW, key=lambda name: behind[name])
     sector, start_known = starts[raw]
     share, sigma = float(found.quadratic.free()[sector]), float(evidence.sigma[sector])
     agrees = abs(share - FRACTIONS[best]) < _TOLERANCE + 3.0 * sigma
-    # Where only a step at the start of the turn shows, one side of the scene against the other, whatever else
-    # differs between the sides looks like it: every start has to be informed, also one where no points are.
+    # Informed for every possible start of the turn, also where there are no points: where only the step
+    # between its end and its start shows, any other difference between the two sides of the scene looks so.
     informed = 0.5 / float(evidence.sigma.max()) ** 2 > needed
     decided = len(excluded) == 2 and agrees and informed
     timings = {
@@ -357,7 +358,8 @@ def _compare_hypotheses(
 
 
 def _in_part(share: float, sigma: float) -> str:
-    """That the points hold a part of the sweep only; empty where they may hold all or nothing of it."""
+    """A sentence that says that the points hold a part of the sweep only; empty where they may hold all or
+    nothing of it."""
     if min(abs(share - f) for f in FRACTIONS.values()) <= _PART + _PART_SIGMAS * sigma:
         return ""
     return (

@@ -63,7 +63,8 @@ def _turn(scan: Scan) -> float | None:
 
 
 def compared_with_times(decision: SweepDecision, turn_s: float) -> SweepDecision:
-    """That the times of the points are given; ``contradiction`` says where the scans show other ones.
+    """The decision where the times of the points are given; its ``contradiction`` says where the scans show
+    other ones.
 
     Args:
         decision: from the same scans without the times.

@@ -179,7 +179,7 @@ class SweepWindow:
         return few
 
     def copy(self) -> SweepWindow:
-        """The same scans; poses that move apart from this window's."""
+        """A window of these scans, whose poses move apart from this one's."""
         other = copy(self)
         other._poses, other._matches = list(self._poses), []
         return other

@@ -57,7 +57,7 @@ class CameraView:
         return seen_from(points, self.rotation, self.position)
 
     def in_sight(self, triangles: FloatArray) -> IndexArray:
-        """Those of the world's triangles (n, 3, 3) that may be in the picture: none of the others is."""
+        """Which of the world's triangles (n, 3, 3) may be in the picture: none of the others is."""
         camera, (x, _, z) = self.camera, self.rotation.T
         # What is wholly behind the camera, or a pixel beyond the left or the right border, is out of sight.
         left, right = camera.fx * x + (camera.cx + 1.0) * z, (camera.width - camera.cx) * z - camera.fx * x

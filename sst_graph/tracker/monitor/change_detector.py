@@ -162,7 +162,7 @@ class ChangeDetector:
         return f"frames of the start contradict each other (chi-square {value:.0f}): it is estimated again"
 
     def recheck_start(self, scan: int, estimate: ComparedEstimate) -> None:
-        """The same check with half as many further frames, and then after each doubling. Wrong labels
+        """:meth:`check_start` with half as many further frames, and then after each doubling. Wrong labels
         contradict a start as a change does, so the start is not given up; but until its frames agree, the
         status is not ``ok``.
         """

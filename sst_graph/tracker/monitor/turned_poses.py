@@ -20,7 +20,7 @@ from sst_graph.types import FloatArray
 _FRAMES = 8
 """Held-out frames in a row that must meet the pictures better at a turned pose."""
 _SUSPECTED = 2
-"""The same for the estimate not to be confirmed."""
+"""Held-out frames in a row after which the estimate counts as not confirmed."""
 _LEAST_USUAL_FRAMES, _USUAL_FRAMES = 10, 300
 """Least and most frames that say how much worse a turned pose usually is."""
 _FEW = 0.2

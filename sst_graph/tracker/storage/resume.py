@@ -103,7 +103,7 @@ def _with_row(rows: NDArray[np.int64], row: NDArray[np.int64]) -> NDArray[np.int
 
 
 def check_inputs(tracker: Tracker) -> None:
-    """That a tracker's setup and inputs are what these functions compare.
+    """Refuse a tracker whose setup or inputs are not what the functions here compare.
 
     Raises:
         ValueError: it is not.

@@ -76,7 +76,7 @@ class SingleObject:
     weight: float
 
     def plus(self, other: SingleObject) -> SingleObject:
-        """These matches and others of the object."""
+        """The sums over these matches and over others of the object."""
         return SingleObject(self.gaussian.plus(other.gaussian), self.weight + other.weight)
 
 

@@ -173,7 +173,7 @@ class Gaussian:
         return Gaussian(self.point, information, np.append(self.vector, np.zeros(count)))
 
     def at(self, point: Point) -> Gaussian:
-        """The same about another, near point; objects that are new there are left out."""
+        """The Gaussian about another, near point; objects that are new there are left out."""
         known = self.point.tracks
         if point.tracks != known:
             point = replace(point, tracks=known, object_biases_px=_picked(point, known))

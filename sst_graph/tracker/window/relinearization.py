@@ -206,7 +206,8 @@ def scans_to_match(
     if relinearization is not None:
         # Those that wait for a first match take the place of those in turn: a frame costs no more for them.
         turn = relinearization.advance(smoother.point, max(0, len(waiting[-4:]) - 1)) or ()
-        # No others: all of the window come in their turn, and the lower edges cost as much.
+        # No stale scans beside these: the relinearization reaches all of the window, and its lower edges cost
+        # as much as they would.
         return chosen | set(leaving) | (set(turn) & set(staleness))
     known = sorted(staleness, key=staleness.__getitem__, reverse=True)
     stale = sum([value > _STALE_SIGMAS for value in staleness.values()])

@@ -129,8 +129,8 @@ class Window:
         return seconds, float(np.linalg.norm(motion.aTb.translation())) / seconds
 
     def lacking_labels(self) -> str:
-        """That the latest images, or scans, show no object of the classes that are aligned while the other
-        sensor's do, in words; empty where both do, or none does, or edges are aligned."""
+        """A sentence: the latest images, or scans, show no object of the classes that are aligned while the
+        other sensor's do; empty where both do, or none does, or edges are aligned."""
         images = _without([image.contours for image in self.images])
         scans = _without([scan.boundaries for _, scan in self.scans])
         if self.edges or (images > 0) == (scans > 0):
