@@ -109,7 +109,7 @@ class IncrementalTerms:
         self._proximal: dict[int, gtsam.NonlinearFactor] = {}
         self._stamps: dict[int, float] = {}
         self._kernel_px = self._config.first_px
-        self._held, self._information = True, 1.0
+        self._with_proximal, self._information = True, 1.0
         self._sides = ObjectSides()
         self._gone = TermSums()
         self._start: tuple[gtsam.Values, FloatArray] | None = None
@@ -169,7 +169,7 @@ class IncrementalTerms:
                 "IncrementalTerms.converge: found no update before it, expected one or more"
             )
         if self._has_new_terms:
-            self._kernel_px, self._held, self._has_new_terms = self._config.first_px, True, False
+            self._kernel_px, self._with_proximal, self._has_new_terms = self._config.first_px, True, False
         update = self._rematch(rounds)
         return replace(update, warnings=tuple(dict.fromkeys((*self._start_warnings, *update.warnings))))
 
@@ -228,8 +228,8 @@ class IncrementalTerms:
             if calm and known:
                 self._kernel_px = config.narrower(self._kernel_px)
             return P[:7, :7], None, False
-        if self._held:
-            self._held = not (calm and known)
+        if self._with_proximal:
+            self._with_proximal = not (calm and known)
             return P[:7, :7], None, False
         found, least = self._robust(P, estimate)
         # The scale is that of what is known beforehand: it must not change with the residuals of the moment,
@@ -269,7 +269,7 @@ class IncrementalTerms:
         matches_now = self._matches()
         removed += self._slots_of(self._proximal)
         self._proximal = {}
-        if self._held and matches_now:
+        if self._with_proximal and matches_now:
             widest = widest_px(matches_now, self._kernel_px)
             for prior in _factors(proximal(matches_now, estimate, widest, self._keys)):
                 graph.add(prior)
@@ -277,8 +277,8 @@ class IncrementalTerms:
         if graph.size() or removed:
             slots = self._solve(graph, gtsam.Values(), {}, removed)
             for owner, slot in zip(owners, slots, strict=True):
-                held = self._proximal if owner is None else owner.slots
-                held[slot] = self._graph().at(slot)
+                owned = self._proximal if owner is None else owner.slots
+                owned[slot] = self._graph().at(slot)
         return len(changed)
 
     def _sums(self, matches: TermMatches, estimate: gtsam.Values) -> TermSums:
@@ -332,10 +332,10 @@ class IncrementalTerms:
             return self._solver.getFactorsUnsafe()
         return self._solver.getFactors()
 
-    def _slots_of(self, held: Mapping[int, gtsam.NonlinearFactor]) -> list[int]:
+    def _slots_of(self, factors: Mapping[int, gtsam.NonlinearFactor]) -> list[int]:
         """Slots that still hold the factors that were put there: a smoother uses those of others again."""
         graph = self._graph()
-        return [slot for slot, factor in held.items() if slot < graph.size() and graph.at(slot) is factor]
+        return [slot for slot, factor in factors.items() if slot < graph.size() and graph.at(slot) is factor]
 
     def _marginal(self) -> FloatArray:
         """(n, n) by the solver, over the columns that all terms share."""
@@ -397,7 +397,7 @@ class IncrementalTerms:
 
     def _leaving(self, stamps: Mapping[int, float]) -> list[int]:
         """Slots of terms whose poses this update marginalizes, while the kernel is still wide."""
-        if not stamps or (self._kernel_px == self._config.last_px and not self._held):
+        if not stamps or (self._kernel_px == self._config.last_px and not self._with_proximal):
             return []
         assert not isinstance(self._solver, gtsam.ISAM2)
         horizon = max(stamps.values()) - self._solver.smootherLag()

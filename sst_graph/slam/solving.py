@@ -105,7 +105,7 @@ def solve_with_terms(
     checked_problem("solve_with_terms", graph, values, lasting)
     if not terms:
         raise EstimationError("solve_with_terms: found no term, expected one or more")
-    keys, kernel_px, held = terms[0].keys, config.first_px, True
+    keys, kernel_px, with_proximal = terms[0].keys, config.first_px, True
     keys.check_kinds(values)
     expect_factors_of("solve_with_terms", graph, keys, ())
     parameters = gtsam.LevenbergMarquardtParams()
@@ -116,7 +116,7 @@ def solve_with_terms(
     converged, rounds = False, 0
     while not converged and rounds < config.most_rounds:
         whole = with_factors(graph, matches)
-        if held:
+        if with_proximal:
             whole.push_back(proximal(matches, values, widest_px(matches, kernel_px), keys))
         values = gtsam.LevenbergMarquardtOptimizer(whole, values, parameters).optimize()
         moved, rounds = moved_px(matches, values), rounds + 1
@@ -124,8 +124,8 @@ def solve_with_terms(
         if kernel_px > config.last_px:
             if calm:
                 kernel_px = config.narrower(kernel_px)
-        elif held:
-            held = not calm
+        elif with_proximal:
+            with_proximal = not calm
         else:
             converged = moved < _STEP_PX
         matches = match_all(terms, values, kernel_px, 1.0)
