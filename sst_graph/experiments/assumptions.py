@@ -37,9 +37,9 @@ SIZES: dict[str, tuple[float, ...]] = {
 CLEAN, DRAWN = "clean", "drawn"
 """A street as it is, and with all parameters drawn from their prior deviations at once."""
 CASES = (CLEAN, DRAWN, *SIZES)
-_TOLD_SIGMAS = 5.0
+_LARGE_SIGMAS = 5.0
 """A size above this many of the deviations that its parameter would have as a variable is to be found."""
-_UNTOLD_SPANS = 0.5
+_PRIOR_SPANS = 0.5
 """A deviation above this share of its parameter's span, the prior of the test, is the prior's."""
 _SILENT_SIGMAS = 3.0
 """A result that is ``ok`` is to be off by no more than this on any of its seven axes."""
@@ -151,7 +151,7 @@ def _deviations(clean: AssumptionRun) -> dict[str, float]:
     return {
         name: sigma
         for name, (_, sigma) in clean.estimates.items()
-        if sigma < _UNTOLD_SPANS * ASSUMPTIONS[name].span
+        if sigma < _PRIOR_SPANS * ASSUMPTIONS[name].span
     }
 
 
@@ -189,7 +189,7 @@ def table(runs: Sequence[AssumptionRun], in_sigmas: bool = False) -> str:
 
     A row holds the runs of one size, or with ``in_sigmas`` those of one size over its deviation.
 
-    "Told" is the size over the deviation that the parameter would have as a variable on the same street.
+    A size in sigmas is in units of the deviation that its parameter would have as a variable on that street.
     "Silent" runs are ``ok`` and more than three sigmas off on an axis.
     """
     sigmas = {
@@ -200,26 +200,26 @@ def table(runs: Sequence[AssumptionRun], in_sigmas: bool = False) -> str:
     }
     rows: dict[tuple[str, float], list[AssumptionRun]] = {}
     for one in runs:
-        size = round(_told(one, sigmas), 6) if in_sigmas and one.size else abs(one.size)
+        size = round(_in_sigmas(one, sigmas), 6) if in_sigmas and one.size else abs(one.size)
         rows.setdefault((one.case, size), []).append(one)
     cells = (_row(case, some, sigmas) for (case, _), some in rows.items())
     return "\n".join([markdown.table(_HEADER, cells), *_summary(runs, sigmas)]) + "\n"
 
 
 _HEADER = (
-    "| broken | by ± | told [σ] | runs | contradicted | named first | not ok | silent "
+    "| broken | by ± | size [σ] | runs | contradicted | named first | not ok | silent "
     "| error [deg, cm, ms], median | NEES / dimension: median, mean |"
 )
 
 
-def _told(one: AssumptionRun, sigmas: Mapping[tuple[int, str], float]) -> float:
+def _in_sigmas(one: AssumptionRun, sigmas: Mapping[tuple[int, str], float]) -> float:
     """Size over the deviation of its parameter on the clean street; NaN where that was not calibrated."""
     return abs(one.size) / sigmas.get((one.seed, one.case), np.nan)
 
 
 def _row(case: str, runs: Sequence[AssumptionRun], sigmas: Mapping[tuple[int, str], float]) -> list[str]:
     size = float(np.median([abs(one.size) for one in runs]))
-    told = np.array([_told(one, sigmas) for one in runs])
+    sizes = np.array([_in_sigmas(one, sigmas) for one in runs])
     errors = np.array([one.error for one in runs])
     turn = np.degrees(np.median(np.linalg.norm(errors[:, :3], axis=1)))
     shift = 100.0 * np.median(np.linalg.norm(errors[:, 3:6], axis=1))
@@ -228,7 +228,7 @@ def _row(case: str, runs: Sequence[AssumptionRun], sigmas: Mapping[tuple[int, st
     return [
         case,
         f"{size:.3g}" if size else "–",
-        f"{np.median(told):.1f}" if size and np.isfinite(told).all() else "–",
+        f"{np.median(sizes):.1f}" if size and np.isfinite(sizes).all() else "–",
         str(len(runs)),
         str(sum(bool(one.contradicted) for one in runs)),
         str(sum(one.contradicted[:1] == (case,) for one in runs)) if size else "–",
@@ -241,8 +241,8 @@ def _row(case: str, runs: Sequence[AssumptionRun], sigmas: Mapping[tuple[int, st
 
 def _summary(runs: Sequence[AssumptionRun], sigmas: Mapping[tuple[int, str], float]) -> list[str]:
     broken = [one for one in runs if one.size]
-    large = [one for one in broken if _told(one, sigmas) > _TOLD_SIGMAS]
-    groups = {f"sizes above {_TOLD_SIGMAS:g} σ": large, "all sizes": broken}
+    large = [one for one in broken if _in_sigmas(one, sigmas) > _LARGE_SIGMAS]
+    groups = {f"sizes above {_LARGE_SIGMAS:g} σ": large, "all sizes": broken}
     groups |= {case: [one for one in runs if one.case == case] for case in (CLEAN, DRAWN)}
     return [
         f"- {name}: {count_of(len(some), 'run')}, {sum(bool(one.contradicted) for one in some)} "
