@@ -125,7 +125,7 @@ class Alignment:
         return some
 
     def _some(self, index: slice | NDArray[np.intp], c_acceleration: FloatArray) -> Alignment:
-        """Of numbers that were checked: to check them again takes longer than all else here."""
+        """Some of the matches, not checked again: a check takes longer than all else here."""
         names = [field.name for field in fields(self)]
         values = {name: getattr(self, name) for name in names} | {"c_acceleration": c_acceleration}
         for name in _OF_EACH_MATCH:

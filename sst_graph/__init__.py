@@ -110,7 +110,7 @@ def __getattr__(name: str) -> Any:
 
 
 def _version() -> str:
-    """Of the installed distribution; a checkout on the path has none."""
+    """Version of the installed distribution; a checkout on the path has none."""
     from importlib.metadata import PackageNotFoundError, version
 
     try:

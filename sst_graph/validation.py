@@ -201,7 +201,7 @@ def _number(value: object, place: str) -> float:
 
 
 def _stretch(stretch: object, place: str) -> PixelStretch:
-    """Of a rectified image: a grid of at least 2x2 places, and a whole step."""
+    """The checked stretch of a rectified image: a grid of at least 2x2 places, and a whole step."""
     if not isinstance(stretch, PixelStretch):
         raise DataError(place, f"a {type(stretch).__name__}", "a PixelStretch")
     squares = _array(stretch.squares, (None, None, 3), f"{place}: squares")

@@ -89,11 +89,11 @@ class PointDeviation(Protocol):
     def scene(self) -> Scene: ...
 
     def effect(self, lPs: FloatArray, offsets_s: FloatArray, uvs: FloatArray) -> Effect:
-        """On points (n, 3) [m] with times (n,) [s] and ideal pixels (n, 2) [px]."""
+        """Effect on points (n, 3) [m] with times (n,) [s] and ideal pixels (n, 2) [px]."""
         ...
 
     def take(self, index: IntArray) -> PointDeviation:
-        """Of some of the points, by position."""
+        """The deviation of some of the points, by position."""
         ...
 
 
@@ -459,7 +459,7 @@ def _contours_or_gradients(
 
 
 def _effect(deviation: PointDeviation, paired: PairedEdges, uvs: FloatArray) -> Effect:
-    """Of the deviation on points at ideal pixels (n, 2) [px]."""
+    """Effect of the deviation on points at ideal pixels (n, 2) [px]."""
     return deviation.effect(paired.points.lPs, paired.points.offsets_s, uvs)
 
 

@@ -87,7 +87,7 @@ class PaperConfig(Settings):
     seed: int = internal(0)
 
     def weight(self, w_l: float) -> float:
-        """Of the loss from pixels to points: w_l, or 0 where it is left out."""
+        """Weight of the loss from pixels to points: w_l, or 0 where it is left out."""
         return w_l if self.bidirectional else 0.0
 
 
@@ -138,7 +138,7 @@ class PaperProblem:
     progress: Progress | None = None
 
     def motions(self, at: Calibration) -> list[list[RelativeMotion]]:
-        """Of each drive's camera, with the depth of LiDAR points at rest."""
+        """Motions of each drive's camera, with the depth of LiDAR points at rest."""
         return camera_motions(self.drives, at, [None] * len(self.drives))
 
     def standstill(self, motions: Sequence[Sequence[RelativeMotion]]) -> list[NDArray[np.bool_]]:

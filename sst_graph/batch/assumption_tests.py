@@ -308,7 +308,7 @@ def _deviation(
     by_image: tuple[FloatArray, IntArray],
     threshold: float,
 ) -> float:
-    """Of a parameter: by the matches, by what shifts from image to image, and for few objects.
+    """Deviation of a parameter: by the matches, by what shifts from image to image, and for few objects.
 
     Args:
         variance: by the matches.

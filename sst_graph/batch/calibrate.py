@@ -176,7 +176,7 @@ def finished(
 
 
 def scan_hashes(drives: Sequence[Drive]) -> list[str]:
-    """Of the drives' scans, the smallest ones: drives with a good part of their scans in common have some of
+    """The smallest hashes of the drives' scans: drives with a good part of their scans in common have some of
     these in common."""
     known = [drive.statistics.scan_hashes() for drive in drives if drive.statistics is not None]
     return sorted(set().union(*known))[:MOST_SCAN_HASHES]

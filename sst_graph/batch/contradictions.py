@@ -214,7 +214,7 @@ _SECOND_STEP = 0.1
 
 
 def _whole_drives(parts: PartSolver, stretches: Sequence[Sequence[SolvedPart]]) -> dict[int, PartEstimate]:
-    """Of several drives each one's own estimate, by its number; drives without one are left out."""
+    """Of several drives, each one's own estimate by its number; drives without one are left out."""
     if len(parts.drives) < 2:
         return {}
     solved = {}

@@ -213,7 +213,7 @@ def guess_as_result(
 
 
 def package_versions() -> dict[str, str]:
-    """Of what took part; OpenCV's by the module, for four distributions bring it."""
+    """Versions of what took part; OpenCV's by the module, for four distributions bring it."""
     return {**{name: _version(name) for name in PACKAGES}, "opencv": str(cv2.__version__)}
 
 

@@ -88,7 +88,7 @@ def _unknown_motion(problem: CalibrationProblem, solution: JointSolution, varian
 def _by_drive(
     problem: CalibrationProblem, estimate: JointEstimate, unknowns: FloatArray
 ) -> tuple[DriveCovariance, ...]:
-    """Of the extrinsic and each drive's own offset, where drives have one each."""
+    """Covariances of the extrinsic and each drive's own offset, where drives have one each."""
     drives = problem.drives if len(estimate.solution.state.time_offsets_s) > 1 else ()
     found = []
     for number, drive in enumerate(drives):

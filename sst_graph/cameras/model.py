@@ -85,7 +85,7 @@ class CameraModel(ABC):
 
 
 def smallest_positive_root(coefficients: NDArray[Any]) -> float:
-    """Of a polynomial, the constant first; inf where there is none."""
+    """Smallest positive root of a polynomial, the constant first; inf where there is none."""
     used = np.trim_zeros(np.array(coefficients, np.float64), "b")
     if len(used) < 2:
         return np.inf

@@ -82,7 +82,7 @@ def camera_of(
 def camera_from_camera_info(
     info: Table, rectified: bool = False, place: str | Path = "CameraInfo"
 ) -> CameraModel:
-    """Of a ROS 1 or ROS 2 ``sensor_msgs/CameraInfo`` by field, K D P or k d p: ``vars(message)``.
+    """The camera of a ROS 1 or ROS 2 ``sensor_msgs/CameraInfo`` by field, K D P or k d p: ``vars(message)``.
 
     Args:
         rectified: the images are those of ``image_rect``: the pinhole of P. A calibration with these holds
@@ -142,7 +142,7 @@ class KalibrCamera:
 
 
 def cameras_from_kalibr(chain: Table, place: str | Path = "camchain") -> dict[str, KalibrCamera]:
-    """Of a Kalibr ``camchain.yaml``: its cameras by name (``cam0`` ...).
+    """The cameras of a Kalibr ``camchain.yaml`` by name (``cam0`` ...).
 
     Raises:
         DataError: no camera, or one with a model that is not supported (omni, eucm, fov).
@@ -190,7 +190,7 @@ def _kalibr_camera(table: Table, place: str) -> KalibrCamera:
 
 
 def camera_from_opencv(table: Table, place: str | Path = "camera file") -> CameraModel:
-    """Of a file that OpenCV's calibration or ROS's ``camera_info_manager`` wrote.
+    """The camera in a file that OpenCV's calibration or ROS's ``camera_info_manager`` wrote.
 
     Matrices are lists, arrays or tables with ``data``. A fisheye says so by ``fisheye_model: 1`` (OpenCV's
     sample) or ``distortion_model: equidistant``.
@@ -254,7 +254,8 @@ def kitti_rectifying_rotation(
 def camera_from_nuscenes(
     calibrated_sensor: Table, width: int = 1600, height: int = 900, place: str | Path = "calibrated_sensor"
 ) -> CameraModel:
-    """Of a record of nuScenes' or nuImages' ``calibrated_sensor``; nuScenes' images are undistorted.
+    """The camera in a record of nuScenes' or nuImages' ``calibrated_sensor``; nuScenes' images are
+    undistorted.
 
     Raises:
         DataError: the sensor is no camera, or has a distortion with more than five coefficients (nuImages'

@@ -186,7 +186,7 @@ class _Sums:
 
     @classmethod
     def of_each(cls, parts: Sequence[PartEstimate], names: Sequence[str]) -> list[_Sums]:
-        """Of each part alone, all about their mean."""
+        """Sums of each part alone, all about their mean."""
         around, found = combined(parts).step, []
         for part in parts:
             J, d, L = _design(part, names), part.step - around, np.linalg.inv(part.covariance)
@@ -204,7 +204,7 @@ class _Sums:
 
     @classmethod
     def joined(cls, parts: Sequence[_Sums]) -> _Sums:
-        """Of several, about one step."""
+        """Several sums as one, about one step."""
         return sum(parts[1:], parts[0])
 
     @property

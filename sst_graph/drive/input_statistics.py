@@ -59,7 +59,7 @@ class Ground:
 
 @dataclass(frozen=True)
 class ScanStatistics:
-    """Of a scan.
+    """What is measured of a scan.
 
     Attributes:
         index: of its frame.
@@ -92,7 +92,7 @@ class ScanStatistics:
     some_points: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
 
     def hash(self) -> str:
-        """Of its points: 16 hexadecimal digits, the same wherever the scan is read."""
+        """Hash of its points: 16 hexadecimal digits, the same wherever the scan is read."""
         own = hashlib.blake2b(self.digest.to_bytes(4, "little"), digest_size=8)
         own.update(self.sample.astype("<u8").tobytes())
         return own.hexdigest()
@@ -100,7 +100,7 @@ class ScanStatistics:
 
 @dataclass(frozen=True)
 class ImageStatistics:
-    """Of an image.
+    """What is measured of an image.
 
     Attributes:
         index: of its frame.
@@ -126,7 +126,7 @@ class ImageStatistics:
 
 @dataclass(frozen=True)
 class InputStatistics:
-    """Of a whole drive, in the order of its scans and images."""
+    """Statistics of a whole drive, in the order of its scans and images."""
 
     scans: tuple[ScanStatistics, ...]
     images: tuple[ImageStatistics, ...]
@@ -166,7 +166,7 @@ class StatisticsCollector:
 
 
 def scan_statistics(index: int, scan: Scan, closely: bool = True) -> ScanStatistics:
-    """Of a scan; the ground, the vehicles and the step of the coordinates only with ``closely``."""
+    """Statistics of a scan; ground, vehicles and the step of the coordinates only with ``closely``."""
     points = np.asarray(scan.points, np.float64)
     ranges = np.linalg.norm(points, axis=1)
     median_range = float(np.median(ranges)) if len(ranges) else 0.0
@@ -228,7 +228,7 @@ def _sample(points: NDArray[np.float32]) -> NDArray[np.uint64]:
 
 
 def image_statistics(index: int, image: CameraImage, closely: bool = True) -> ImageStatistics:
-    """Of an image; the picture along the contours only with ``closely``."""
+    """Statistics of an image; the picture along the contours only with ``closely``."""
     labelled = _counts(image.mask)
     height, width = image.mask.shape
     # Sums of the places of each class's pixels: whole numbers below 2^53, which are exact.

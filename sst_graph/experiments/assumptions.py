@@ -147,7 +147,7 @@ def runs_of(config: AssumptionTableConfig, progress: Progress | None) -> Iterato
 
 
 def _deviations(clean: AssumptionRun) -> dict[str, float]:
-    """Of the parameters that a clean street determines, by name."""
+    """Deviations of the parameters that a clean street determines, by name."""
     return {
         name: sigma
         for name, (_, sigma) in clean.estimates.items()

@@ -112,7 +112,7 @@ def _solved(problem: CalibrationProblem, start: State) -> State:
 
 
 def _turned(state: State, axis: int, degrees: float) -> Iterator[State]:
-    """Both ways about an axis of the LiDAR."""
+    """The state turned both ways about an axis of the LiDAR."""
     for sign in (-1.0, 1.0):
         step = np.zeros(6)
         step[axis] = sign * np.radians(degrees)

@@ -152,7 +152,7 @@ def _block(marginal: RigMarginal, camera: int) -> FloatArray:
 
 
 def _joint_nees(street: _Street) -> tuple[float, float]:
-    """Of all cameras together: with the joint covariance, and as if they were independent."""
+    """NEES of all cameras together: with the joint covariance, and as if they were independent."""
     errors, whole = _errors(street.own, street.truths), street.own.covariance
     apart = np.mean([_nees(error, _block(street.own, k)) for k, error in enumerate(errors)])
     return _nees(errors.reshape(-1), whole), float(apart)

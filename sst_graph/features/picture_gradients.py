@@ -69,7 +69,7 @@ class PictureGradients:
 
     @classmethod
     def of(cls, picture: Picture, valid: NDArray[np.bool_] | None = None) -> PictureGradients:
-        """Of a picture (h, w, 3).
+        """The gradients of a picture (h, w, 3).
 
         Args:
             valid: (h, w) where the lens shows anything; there is no edge beside pixels where it does not.
@@ -121,7 +121,7 @@ class PictureGradients:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of the strengths, which are not read for it."""
+        """Shape of the strengths, which are not read for it."""
         return shape_of(self, "strengths")
 
 

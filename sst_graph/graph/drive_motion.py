@@ -35,7 +35,7 @@ class DriveMotion:
 
     @classmethod
     def of(cls, drive: Drive, objects: Mapping[ObjectId, int] | None = None) -> DriveMotion:
-        """Of a whole drive, its objects tested for motion where their tracks are given."""
+        """The motion of a whole drive, its objects tested for motion where their tracks are given."""
         motion = cls(GrowingTwists().of(drive.lidar_motions), scan_poses(drive))
         return (
             motion if objects is None else motion.with_objects(objects, find_dynamic_objects(drive, objects))
@@ -51,7 +51,7 @@ class DriveMotion:
         return replace(self, objects=objects, dynamic=by_scan)
 
     def part(self, scans: Sequence[int]) -> DriveMotion:
-        """Of some scans of the drive (:meth:`Drive.part`), which are renumbered from 0."""
+        """The motion at some scans of the drive (:meth:`Drive.part`), which are renumbered from 0."""
         place = {position: k for k, position in enumerate(scans)}
         return replace(
             self,
@@ -80,6 +80,10 @@ class DriveMotion:
 def motions_of(
     drives: Sequence[Drive], objects: Sequence[Mapping[ObjectId, int]] | None = None
 ) -> list[DriveMotion]:
-    """Of each drive; objects: tracks of the objects of each, where these have mask biases of their own."""
+    """The motion of each drive.
+
+    Args:
+        objects: tracks of the objects of each drive, where these have mask biases of their own.
+    """
     tracks = [None] * len(drives) if objects is None else objects
     return [DriveMotion.of(drive, own) for drive, own in zip(drives, tracks, strict=True)]

@@ -186,12 +186,12 @@ class _Frames:
 
     @cached_property
     def groups(self) -> ImageGroups:
-        """Its images in the alignment."""
+        """Where the matches of each image stand in the alignment."""
         return ImageGroups.of(self.alignment, self.bounds)
 
     @cached_property
     def columns(self) -> IntArray:
-        """Of the extrinsic, the time offset and the parameters."""
+        """Columns of the extrinsic, the time offset and the parameters."""
         return np.array([*range(6), self.clock, *self.term_columns])
 
     @cached_property
@@ -241,7 +241,7 @@ class FrozenProblem:
 
     @property
     def ordering(self) -> gtsam.Ordering:
-        """Of all unknowns, as in the normal equations, the twists last."""
+        """Order of all unknowns, as in the normal equations, the twists last."""
         return _ordered((EXTRINSIC, *self._keys, *self._images.keys))
 
     def optimum(self, iterations: int) -> tuple[FrozenPoint, NormalEquations]:

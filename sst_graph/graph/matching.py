@@ -436,12 +436,12 @@ class DriveMatches:
 
     @property
     def alignment(self) -> Alignment:
-        """Of all matches."""
+        """The alignment of all matches."""
         return self.found.alignment
 
     @property
     def number(self) -> int:
-        """Of the drive."""
+        """Number of the drive."""
         return self.edges.number
 
     @cached_property
@@ -555,7 +555,7 @@ class DriveMatches:
         )
 
     def _alignment_of(self, own: slice, motion: CameraTwist) -> Alignment:
-        """Of one group."""
+        """The alignment of one group."""
         alone = own == slice(0, len(self)) and self.alignment.c_acceleration.ndim == 1
         return self.alignment if alone else self.alignment.of_one_image(own, motion.c_acceleration)
 

@@ -29,12 +29,12 @@ class Deviation:
     scene: Scene
 
     def effect(self, lPs: FloatArray, offsets_s: FloatArray, uvs: FloatArray) -> Effect:
-        """On points (n, 3) [m] with times (n,) [s] and ideal pixels (n, 2) [px]."""
+        """Effect on points (n, 3) [m] with times (n,) [s] and ideal pixels (n, 2) [px]."""
         view = self.scene.view(lPs, offsets_s, uvs)
         return combined([(theta, ASSUMPTIONS[name].effect(view)) for name, theta in self.values.items()])
 
     def take(self, index: IntArray) -> Deviation:
-        """Of some of the points, by position."""
+        """The deviation of some of the points, by position."""
         return replace(self, scene=taken(self.scene, index))
 
 

@@ -172,7 +172,7 @@ class JointSolution:
 
     @cached_property
     def values(self) -> gtsam.Values:
-        """Its optimum."""
+        """The unknowns at the optimum of the last frozen problem."""
         return self.frozen.values_at(self.optimum)
 
 

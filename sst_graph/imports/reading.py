@@ -176,7 +176,7 @@ _Reader = Callable[[Document, ImportOptions, str], ImportedCalibration]
 
 
 def _by(read: Callable[[Document, ImportOptions], Found]) -> _Reader:
-    """Of a reader that knows what the poses of its format are."""
+    """The reader of a format by one that knows what the poses of its format are."""
 
     def imported(document: Document, options: ImportOptions, form: str) -> ImportedCalibration:
         found = read(document, options)
@@ -186,7 +186,7 @@ def _by(read: Callable[[Document, ImportOptions], Found]) -> _Reader:
 
 
 def _of_frames(document: Document, options: ImportOptions, form: str) -> ImportedCalibration:
-    """Of a format that holds named frames, and a time offset in a comment at best."""
+    """The calibration in a format that holds named frames, and a time offset in a comment at best."""
     transforms = _TREES[form](document)
     tree = Transforms() if options.tree is None else options.tree.beside(transforms)
     cTl, camera, lidar = extrinsic_between(transforms.joined(tree), options, document.path)

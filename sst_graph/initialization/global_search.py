@@ -150,7 +150,7 @@ class SearchProblem:
 
     @property
     def spacing(self) -> float:
-        """Of the grid of rotations [rad]."""
+        """Step of the grid of rotations [rad]."""
         return float(_GRID_STEP if self.guess.cTl is None else _BOX_STEP)
 
     def grid(self) -> States:

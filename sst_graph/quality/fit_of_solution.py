@@ -90,7 +90,7 @@ class FitOfDrives:
         iterations: Sequence[OuterIteration],
         profiles: Sequence[Profile],
     ) -> Fit | None:
-        """Of a state; None where no boundary point has a contour or an edge.
+        """The fit of a state; None where no boundary point has a contour or an edge.
 
         Args:
             start: as :meth:`quality` has it.

@@ -78,7 +78,7 @@ class CameraInfluences:
 
     @classmethod
     def of(cls, outcome: JointOutcome) -> CameraInfluences:
-        """Of a solved problem."""
+        """The influences on the estimate of a solved problem."""
         robust, solution = outcome.estimate.robust, outcome.estimate.solution
         scores = robust.table.scores
         # 1. How the parts of the covariance are composed.

@@ -82,7 +82,7 @@ class Subscription:
 
 
 class Publishers:
-    """Of status, transforms and diagnostics."""
+    """The publishers of status, transforms and diagnostics."""
 
     def __init__(self, node: Any) -> None:
         from diagnostic_msgs.msg import DiagnosticArray

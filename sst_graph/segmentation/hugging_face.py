@@ -16,7 +16,7 @@ from sst_graph.segmentation.segmenter import ImageLabels
 from sst_graph.types import CameraImage, SemanticClass
 
 VERSION = 1
-"""Of what is done beside the model: other labels from the same model need another number."""
+"""Version of what is done beside the model: other labels from the same model need another number."""
 
 
 class HuggingFaceSegmenter:
@@ -51,12 +51,12 @@ class HuggingFaceSegmenter:
 
     @property
     def known(self) -> frozenset[SemanticClass]:
-        """Of its labels."""
+        """Classes that its labels name."""
         return self.numbers.known
 
     @property
     def identity(self) -> str:
-        """Of the weights, the configuration and what is done with them."""
+        """Identity of the weights, the configuration and what is done with them."""
         digest = hashlib.sha256(repr((VERSION, self._model.config.to_json_string(use_diff=False))).encode())
         digest.update(self._processor.to_json_string().encode())
         digest.update(repr(sorted((k, int(c)) for k, c in self.numbers.classes.items())).encode())

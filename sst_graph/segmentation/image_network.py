@@ -20,7 +20,7 @@ from sst_graph.types import CameraImage, SemanticClass
 
 Output = Literal["logits", "labels", "instances"]
 VERSION = 1
-"""Of what is done beside the network: other labels from the same network and file need another number."""
+"""Version of what is done beside the network: other labels from the same network and file need another."""
 
 MIN_SCORE = 0.5
 """Detections below this score are left out, as the demos of Mask R-CNN and YOLO do."""
@@ -94,14 +94,14 @@ class OnnxImageSegmenter:
 
     @property
     def identity(self) -> str:
-        """Of the network and of what is done with it."""
+        """Identity of the network and of what is done with it."""
         model = self.model
         use = self._input, model.output, sorted(model.outputs.items()), model.min_score
         return self._network.identity(VERSION, model.numbers, use)
 
     @property
     def known(self) -> frozenset[SemanticClass]:
-        """Of its class map."""
+        """Classes that its class map names."""
         return self.model.numbers.known
 
     def segment(self, image: CameraImage) -> ImageLabels:

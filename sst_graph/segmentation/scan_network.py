@@ -17,7 +17,7 @@ from sst_graph.segmentation.segmenter import PointLabels
 from sst_graph.types import Scan, SemanticClass
 
 VERSION = 1
-"""Of what is done beside the network: other labels from the same network and file need another number."""
+"""Version of what is done beside the network: other labels from the same network and file need another."""
 
 
 @dataclass(frozen=True)
@@ -67,14 +67,14 @@ class OnnxScanSegmenter:
 
     @property
     def identity(self) -> str:
-        """Of the network and of what is done with it."""
+        """Identity of the network and of what is done with it."""
         model = self.model
         use = model.view, model.neighbours, model.output, model.output_name
         return self._network.identity(VERSION, model.numbers, use)
 
     @property
     def known(self) -> frozenset[SemanticClass]:
-        """Of its class map; no point of a scan is sky."""
+        """Classes that its class map names; no point of a scan is sky."""
         return self.model.numbers.known - {SemanticClass.SKY}
 
     def segment(self, scan: Scan) -> PointLabels:

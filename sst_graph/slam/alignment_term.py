@@ -259,7 +259,7 @@ class AlignmentTerm:
 
     @property
     def features(self) -> tuple[ScanFeatures, ...]:
-        """Of the scans."""
+        """Features of the scans."""
         return cast(tuple[ScanFeatures, ...], self.scans)
 
     @property
@@ -381,7 +381,7 @@ class AlignmentTerm:
         )
 
     def residuals_of(self, matches: TermMatches, values: gtsam.Values) -> list[tuple[FloatArray, FloatArray]]:
-        """Of each alignment, (rows,) residuals at the values [px] and their Jacobian (rows, 7) by extrinsic
+        """For each alignment, (rows,) residuals at the values [px] and their Jacobian (rows, 7) by extrinsic
         and offset, the trajectory and the camera's twist held."""
         place = matches.place
         if place is None:

@@ -175,7 +175,7 @@ class TermSums:
 
     @classmethod
     def of(cls, rows: TermRows, information: float) -> TermSums:
-        """Of one term."""
+        """Sums over the matches of one term."""
         roots = np.sqrt(rows.weights) / rows.sigmas_px
         J = rows.J * roots[:, None]
         scores = ScoreSums.of_frame(J, roots, rows.sides, rows.level)

@@ -38,7 +38,7 @@ class ObjectSides:
         self._names: dict[tuple[int, SemanticClass, int], int] = {}
 
     def of(self, scan_ns: int, found: FrameAlignments, wTl: gtsam.Pose3) -> list[NDArray[np.intp]]:
-        """Of each alignment, (n,) number of the side that each match lies on.
+        """For each alignment, (n,) number of the side that each match lies on.
 
         Args:
             scan_ns: stamp of the scan, which names its objects.

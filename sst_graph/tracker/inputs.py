@@ -169,7 +169,7 @@ class FrozenSensors:
 
 
 def _digest(array: NDArray[Any]) -> int:
-    """Of every fourth row: noise is in all of them."""
+    """Checksum of every fourth row: noise is in all of them."""
     return zlib.crc32(np.ascontiguousarray(array[::4]).data)
 
 

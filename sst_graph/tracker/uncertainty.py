@@ -52,7 +52,7 @@ class Uncertainty:
 
     @classmethod
     def of(cls, smoother: WindowSmoother) -> Uncertainty:
-        """Of a smoother's estimate.
+        """The uncertainty of a smoother's estimate.
 
         Raises:
             EstimationError: it has no covariance.

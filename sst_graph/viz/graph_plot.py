@@ -69,7 +69,7 @@ class _Frame:
 
 
 def _draw_frame(ax: Any, frame: _Frame) -> None:
-    """Its twist, its motion and its silhouettes, with their edges."""
+    """Draw a frame: its twist, its motion and its silhouettes, with their edges."""
     x, silhouette = frame.x, (frame.x, _SILHOUETTE)
     for at in frame.bases:
         _edge(ax, silhouette, at, "tab:orange")

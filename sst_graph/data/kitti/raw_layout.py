@@ -175,7 +175,7 @@ def _drives(path: Path) -> list[Path]:
 
 
 def _names(drive: Path) -> tuple[str, ...]:
-    """By which a drive may be asked for: its folder's name, its number, both with its kind."""
+    """Names by which a drive may be asked for: its folder's name, its number, both with its kind."""
     name = drive.resolve().name
     match = _DRIVE.fullmatch(name)
     if match is None:

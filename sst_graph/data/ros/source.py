@@ -197,7 +197,7 @@ def _check_masks(bag: Bag, index: BagIndex) -> None:
 def _geometry(
     path: Path, topics: Topics, index: BagIndex, size: tuple[int, int], options: SourceOptions
 ) -> ImageGeometry:
-    """Of the images: by the file that the options name, or by their CameraInfo."""
+    """Geometry of the images: by the file that the options name, or by their CameraInfo."""
     if options.camera_file is not None:
         if options.info_topic is not None:
             raise ConfigError(f"--info-topic {options.info_topic}: means nothing with --camera-file")

@@ -411,7 +411,7 @@ def sectors_of(azimuths_rad: FloatArray) -> IndexArray:
 
 
 def _of_every_direction(normals: FloatArray, most: int) -> IndexArray:
-    """Of patches with normals (n, 3): at most so many of each direction, level ones being one more."""
+    """Some of the patches with normals (n, 3): at most so many of each direction, level being one more."""
     number = np.mod(np.arctan2(normals[:, 1], normals[:, 0]), np.pi) / np.pi * _DIRECTIONS
     upright = np.minimum(number.astype(np.intp), _DIRECTIONS - 1)
     direction = np.where(np.abs(normals[:, 2]) > _LEVEL, _DIRECTIONS, upright)

@@ -81,7 +81,7 @@ class TurnedPoses:
         return self._place(_SUSPECTED) is not None
 
     def _place(self, frames: int) -> int | None:
-        """Of the turned pose that so many frames in a row agree with."""
+        """Place of the turned pose that so many frames in a row agree with."""
         if len(self.gains) < frames or len(self.usual) < _LEAST_USUAL_FRAMES:
             return None
         low, usual = np.quantile(self.usual, [_FEW, 0.5])

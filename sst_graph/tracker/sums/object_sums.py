@@ -82,7 +82,7 @@ class SingleObject:
 
 @dataclass
 class ObjectSums:
-    """Of frames that have left the window; matrices in the columns of the Gaussian that holds them.
+    """Sums over frames that have left the window; matrices in the columns of the Gaussian that holds them.
 
     Attributes:
         closed: (n, n) sum of squared scores that stand for the objects gone.

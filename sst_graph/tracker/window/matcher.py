@@ -240,7 +240,7 @@ class WindowMatcher:
         return linearize_pairs(list(pairs.values()), point, columns, share, by_object)
 
     def _motion_of(self, part: Drive, numbers: list[int]) -> DriveMotion:
-        """Of the LiDAR, made once a scan, and of the objects where they have biases."""
+        """Motion of the LiDAR, made once a scan, and of the objects where they have biases."""
         if self._motion is None or self._motion[0] != self.window.next_scan:
             self._motion = (self.window.next_scan, DriveMotion(self._growing.of(part.lidar_motions)))
         motion = self._motion[1]

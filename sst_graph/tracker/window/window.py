@@ -45,7 +45,7 @@ class Stretch:
     at_end: bool = False
 
     def motion(self, drive: Drive) -> DriveMotion:
-        """Of the LiDAR and the objects; drive: this one, with some of its boundary points."""
+        """Motion of the LiDAR and the objects; drive: this one, with some of its boundary points."""
         return DriveMotion.of(drive).with_objects(self.tracks, self.dynamic)
 
 
@@ -216,7 +216,7 @@ class Window:
         return tracks, dynamic
 
     def poses_of(self, numbers: Sequence[int]) -> list[gtsam.Pose3]:
-        """Of some scans, in the world."""
+        """Poses of some scans, in the world."""
         return [self.poses[number] for number in numbers]
 
     def add_image(self, features: ImageFeatures, pair: ImagePair | None = None) -> None:
