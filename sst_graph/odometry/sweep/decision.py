@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 
@@ -303,18 +303,50 @@ def _window_positions(pair: _PairMotion, count: int, every: int) -> list[int]:
     return list(range(first, min(count, first + length + 1), every))
 
 
-def _decide(windows: Sequence[SweepWindow], timing: SweepTiming) -> SweepDecision:
-    """The decision from some windows."""
+def _decide(windows: list[SweepWindow], timing: SweepTiming) -> SweepDecision:
+    """The decision from some windows, which take the poses of the best fit."""
     speed = max(float(np.linalg.norm(window.twists[:, 3:], axis=1).mean()) for window in windows)
-    fraction, sector = 0.0, 0
+    start = 0.0, 0
     turn = max(float(np.linalg.norm(window.twists[:, :3], axis=1).mean()) for window in windows)
     if (speed + turn * _REACH_M) * timing.period_s > _LONG_SWEEP_M:
-        fraction, sector = _best_start(windows[0].thinned(_FEW_SCANS, _FEW_POINTS))
-    found = estimate(windows, fraction, sector)
+        start = _best_start(windows[0].thinned(_FEW_SCANS, _FEW_POINTS))
+    before, fits = list(windows), [_Fit.of(windows, start)]
+    windows[:] = fits[0].windows
     if not any(window.has_matches for window in windows):
         others = _both_senses(timing)
         return SweepDecision("undecided", timing, speed_mps=speed, others=others)
-    return replace(_compare_hypotheses(windows, found, timing), speed_mps=speed)
+    decision = _compare_hypotheses(*fits[0], timing)
+    if decision.kind != "undecided" or decision.contradiction:
+        # Sparse scans meet equally well under several shares, each with matches that confirm it.
+        fits += [_Fit.of(before, (f, 0)) for f in _TRIED if (f, 0) != start]
+        best = min(fits, key=lambda fit: fit.estimate.misfit)
+        alike = [fit for fit in fits if fit.estimate.worse_by(best.estimate) < _SURELY_WORSE]
+        decision = _in_common([_compare_hypotheses(*fit, timing) for fit in alike], timing)
+        windows[:] = best.windows
+    return replace(decision, speed_mps=speed)
+
+
+class _Fit(NamedTuple):
+    """Windows with the poses of an estimate that begins somewhere."""
+
+    windows: Sequence[SweepWindow]
+    estimate: SweepEstimate
+
+    @classmethod
+    def of(cls, windows: Sequence[SweepWindow], start: tuple[float, int]) -> _Fit:
+        """From a share of the sweep, and a sector at whose border a turn begins."""
+        copies = [window.copy() for window in windows]
+        return cls(copies, estimate(copies, *start))
+
+
+def _in_common(decisions: Sequence[SweepDecision], timing: SweepTiming) -> SweepDecision:
+    """The first of some decisions about the same scans, in as far as all others are the same."""
+    first = decisions[0]
+    if len({(decision.kind, bool(decision.contradiction)) for decision in decisions}) == 1:
+        return first
+    least = {name: min(one.worse_by[name] for one in decisions) for name in first.worse_by}
+    undecided = replace(first, kind="undecided", timing=timing, start_known=False, contradiction="")
+    return replace(undecided, worse_by=least, others=_both_senses(timing))
 
 
 def _compare_hypotheses(
@@ -424,5 +456,8 @@ def _best_start(window: SweepWindow) -> tuple[float, int]:
 _COARSE = 8
 """Sectors between the starts that are tried first."""
 _TRIED = (0.0, -1.0, 1.0)
+"""Shares of the sweep that registration begins with."""
+_SURELY_WORSE = 3.0
+"""A fit that is worse by more sigmas than this is no answer."""
 _FEW_SCANS, _FEW_POINTS, _TRIED_ITERATIONS = 6, 60, 4
 """Scans, points of each direction of normals, and iterations for each start that is tried."""

@@ -71,6 +71,7 @@ class SweepEstimate:
         normals: of the windows, at the last matches.
         linearized_at: share and start under which those were made.
         misfit: mean robust misfit of the matches at the end, 0 to 1.
+        missed: (pairs of scans,) :meth:`SweepWindow.missed` of all windows.
     """
 
     fraction: float
@@ -79,6 +80,13 @@ class SweepEstimate:
     normals: tuple[Normal, ...]
     linearized_at: tuple[float, int]
     misfit: float
+    missed: FloatArray
+
+    def worse_by(self, other: SweepEstimate) -> float:
+        """By how many sigmas this fits worse than another estimate from the same windows: the mean over the
+        pairs of scans, with its standard error."""
+        more = self.missed - other.missed
+        return float(more.sum() / max(np.sqrt(((more - more.mean()) ** 2).sum()), 1e-9))
 
     def evidence(self, windows: Sequence[SweepWindow]) -> SweepEvidence:
         """Evidence for every start of a turn, at the last matches."""
@@ -163,7 +171,7 @@ def estimate(windows: Sequence[SweepWindow], fraction: float = 0.0, sector: int 
         sector = best
         if done:
             break
-    return SweepEstimate(fraction, sector, quadratic, normals, present, _misfit(windows))
+    return SweepEstimate(fraction, sector, quadratic, normals, present, *_misfit(windows))
 
 
 def at_hypothesis(
@@ -175,7 +183,8 @@ def at_hypothesis(
         _move(windows, normals, np.zeros(1 + SECTORS))
     shares = quadratic.free()
     best = int(np.argmin(quadratic.cost(shares)))
-    return SweepEstimate(float(shares[best]), best, quadratic, normals, (fraction, sector), _misfit(windows))
+    present = fraction, sector
+    return SweepEstimate(float(shares[best]), best, quadratic, normals, present, *_misfit(windows))
 
 
 def _matched(
@@ -193,5 +202,7 @@ def _move(windows: Sequence[SweepWindow], normals: Sequence[Normal], step: Float
         window.move(normal, step)
 
 
-def _misfit(windows: Sequence[SweepWindow]) -> float:
-    return float(np.mean([window.misfit() for window in windows]))
+def _misfit(windows: Sequence[SweepWindow]) -> tuple[float, FloatArray]:
+    """Mean misfit, and points missed by each pair of scans."""
+    missed = np.concatenate([window.missed() for window in windows])
+    return float(np.mean([window.misfit() for window in windows])), missed

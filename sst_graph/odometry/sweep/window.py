@@ -312,10 +312,14 @@ class SweepWindow:
 
     def misfit(self) -> float:
         """Mean robust misfit of the chosen points, 0 (all on a surface) to 1 (none near one)."""
-        scale = _SCALES_M[-1]
-        good = sum(float((1.0 / (1.0 + (rows.residuals / scale) ** 2)).sum()) for rows in self._matches)
         count = sum(len(self._surfaces[rows.scans[1]].chosen) for rows in self._matches)
-        return 1.0 - good / max(count, 1)
+        return float(self.missed().sum()) / max(count, 1)
+
+    def missed(self) -> FloatArray:
+        """(pairs of scans,) chosen points of each pair that lie on no surface, by the robust kernel."""
+        scale = _SCALES_M[-1]
+        near = [(1.0 / (1.0 + (rows.residuals / scale) ** 2)).sum() for rows in self._matches]
+        return np.array([len(self._surfaces[rows.scans[1]].chosen) for rows in self._matches]) - near
 
     def _matched(self, a: int, b: int, posed: Sequence[_PosedScan], gate: float, scale: float) -> _Matches:
         """Points of scan b matched to surfaces of scan a."""
