@@ -17,7 +17,7 @@ from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import Drive, PrepareConfig, prepare_drive
 from sst_graph.experiments.wrong_drives import with_distortion
 from sst_graph.simulator import SimulatedDrive, SimulationConfig
-from sst_graph.types import CameraImage, SemanticClass
+from sst_graph.types import CameraImage, Frame, SemanticClass
 
 TRACKED_STREET = SimulationConfig(
     seed=3,
@@ -99,6 +99,21 @@ def crowded_street(k1: float = 0.0) -> KeptDrive:
 
 EARLY_START = TrackerConfig(start_scans=8)
 """The first estimate comes with the eighth frame, where its work is not spread over frames."""
+
+
+def picked_frames(fast: SimulatedDrive, count: int, first: int, clock_set: bool) -> list[Frame]:
+    """Every third scan of a fast drive with its image; from a frame on that of the next third of a period.
+
+    Its stamps jump against their interval as those of a camera whose clock was set: ``clock_set`` makes it
+    one, by the pictures of the scans' own instants.
+    """
+    frames = []
+    for k in range(count):
+        scan, image = fast.read_scan(3 * k), fast.read_image(3 * k + (k >= first and not clock_set))
+        assert scan is not None and image is not None
+        stamp_ns = int(fast.stamps_ns[3 * k + (k >= first)])
+        frames.append(Frame(k, scan=scan, image=dataclasses.replace(image, stamp_ns=stamp_ns)))
+    return frames
 
 
 def tracker_from_truth(street: SimulatedDrive, config: TrackerConfig = EARLY_START) -> Tracker:

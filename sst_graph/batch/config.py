@@ -93,8 +93,8 @@ class CalibrationConfig(Settings):
     for_report: bool = internal(True)
     check_stamps: bool = setting(
         True,
-        doc="Report a result as not converged where a sensor's stamps jump. Set to false for sensors "
-        "without a steady rate.",
+        doc="Report a result as not converged where a sensor's stamps jump, unless the labels before and "
+        "after show one time offset. Set to false for sensors without a steady rate.",
     )
     find_causes: bool = setting(
         True,

@@ -9,13 +9,15 @@ step: those beyond the kernel are gone.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from sst_graph.batch.method_estimate import CALIBRATE_APART, StampJumps, jump_sentence, jumps_in
 from sst_graph.batch.part_solver import Part, PartSolver, SolvedPart
 from sst_graph.covariance.contradiction import Difference, PartEstimate, combined, name_step
+from sst_graph.drive.stamp_intervals import Jump
 from sst_graph.graph.state import State
 
 FALSE_ALARM = 1e-3
@@ -28,6 +30,11 @@ _MOST_STRETCHES = 8
 """Stretches that a drive is cut into: each costs a solution of its scans."""
 _LEAST_SCANS = 4
 """Fewest scans of a stretch: fewer seldom determine an estimate."""
+
+
+_AGREES, _CONTRADICTS = 3.0, 4.0
+"""After a jump the stamps are right where the time offset has changed by fewer sigmas than the first, and
+differs from the jump by more than the second."""
 
 
 @dataclass(frozen=True)
@@ -301,3 +308,48 @@ def _difference_document(difference: Difference) -> dict[str, Any]:
         "degrees_of_freedom": difference.freedom,
         "p_value": difference.p_value,
     }
+
+
+def jumps_by_labels(parts: PartSolver) -> StampJumps:
+    """The jumps of the stamps, with the frames before and after each solved by themselves.
+
+    One odd interval is a clock that was set, or a camera that paused for part of its period, or a frame that
+    was picked from a faster camera one later: then the stamps are right.
+    """
+    reasons, remarks = list[str](), list[str]()
+    for number, drive in enumerate(parts.drives):
+        jumps = jumps_in(drive)
+        ends = [jump.place[1] for jump in jumps]
+        scans = [tuple(range(a, b)) for a, b in zip([0, *ends], [*ends, len(drive.scans)], strict=True)]
+        solved = [_between_jumps(parts, Part(number, own), jumps) for own in scans] if jumps else []
+        for jump, before, after in zip(jumps, solved[:-1], solved[1:], strict=True):
+            sentence = jump_sentence(drive, jump)
+            step_s, sigma_s = _offset_step(before, after)
+            if abs(step_s) > _AGREES * sigma_s or abs(step_s - jump.time_offset_s) < _CONTRADICTS * sigma_s:
+                reasons.append(f"{sentence}: {CALIBRATE_APART}")
+                continue
+            remarks.append(
+                f"{sentence}, but by the labels before and after it the time offset is the same (they differ "
+                f"by {1e3 * step_s:+.1f} +- {1e3 * sigma_s:.1f} ms): the sensor has paused, and its stamps "
+                "are right"
+            )
+    return StampJumps(tuple(reasons), tuple(remarks))
+
+
+def _between_jumps(parts: PartSolver, part: Part, jumps: Sequence[Jump]) -> SolvedPart | None:
+    """A part by itself, from the estimate of all, or from one whose time offset differs by a jump."""
+    reference = parts.reference_of(part)
+    shifts_s = [sign * jump.time_offset_s for jump in jumps for sign in (-1.0, 1.0)]
+    offset_s = reference.time_offsets_s[0]
+    starts = [replace(reference, time_offsets_s=(offset_s + shift_s,)) for shift_s in shifts_s]
+    return parts.solve_from(part, parts.best_start(part, starts)) if part.scans else None
+
+
+def _offset_step(before: SolvedPart | None, after: SolvedPart | None) -> tuple[float, float]:
+    """By how much the time offset changes from one part to another with the same extrinsic, and its standard
+    deviation [s]; infinite where one of them has no estimate."""
+    if before is None or after is None:
+        return 0.0, np.inf
+    found = Difference.of(before.step, after.step)
+    weights = np.linalg.inv(found.covariance)[6]
+    return float(weights @ found.step / weights[6]), float(1.0 / np.sqrt(weights[6]))

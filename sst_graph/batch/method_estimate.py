@@ -24,7 +24,7 @@ from sst_graph.covariance.observability import (
 )
 from sst_graph.covariance.shared_errors import SharedErrors
 from sst_graph.drive.preparation import Drive
-from sst_graph.drive.stamp_intervals import jumps_of
+from sst_graph.drive.stamp_intervals import Jump, jumps_of
 from sst_graph.fit import EDGES_QUALITY, QUALITY, Fit
 from sst_graph.graph.outer_loop import JointSolution
 from sst_graph.graph.state import State
@@ -57,6 +57,45 @@ class DriveCovariance:
 
 
 @dataclass(frozen=True)
+class StampJumps:
+    """What the jumps of the stamps in some drives mean.
+
+    Attributes:
+        reasons: the jumps after which another time offset may hold.
+        remarks: those after which it is the same, as the labels show.
+    """
+
+    reasons: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+    @classmethod
+    def by_stamps(cls, drives: Sequence[Drive]) -> StampJumps:
+        """By the stamps alone: any jump may be a clock that was set."""
+        return cls(
+            tuple(f"{jump_sentence(d, jump)}: {CALIBRATE_APART}" for d in drives for jump in jumps_in(d))
+        )
+
+
+CALIBRATE_APART = (
+    "calibrate the frames before it and those from it on apart, or, of a sensor without a steady rate, use "
+    "--set check_stamps=false"
+)
+"""Advice for a jump of the stamps."""
+
+
+def jumps_in(drive: Drive) -> list[Jump]:
+    """Jumps of a drive's stamps that change its time offset where a clock was set."""
+    return jumps_of(drive.image_stamps_ns, drive.scan_stamps_ns)
+
+
+def jump_sentence(drive: Drive, jump: Jump) -> str:
+    """Where a jump is, and how large."""
+    image, scan = jump.place
+    frame = drive.images[image].index if jump.sensor == "image" else drive.scans[scan].index
+    return f"{drive.name}: {jump.sentence} at frame {frame}"
+
+
+@dataclass(frozen=True)
 class MethodEstimate:
     """The estimate of a method, and what it reports.
 
@@ -78,6 +117,7 @@ class MethodEstimate:
         by_sweeps: (7, 7) part of the covariance by sweeps that the scans leave undecided.
         open_sweeps: that such sweeps matter, which makes the status ``unobservable``.
         shared: errors that other cameras on the LiDAR have, too, of methods without ``solved``.
+        jumps: of the stamps, by methods that compare the labels before and after them.
         assumption_steps: (7,) step of the estimate by one deviation of each assumption that is considered in
             the covariance, by name.
     """
@@ -100,6 +140,7 @@ class MethodEstimate:
     by_sweeps: FloatArray = field(default_factory=lambda: np.zeros((7, 7)))
     open_sweeps: tuple[str, ...] = ()
     shared: SharedErrors | None = None
+    jumps: StampJumps | None = None
     assumption_steps: Mapping[str, FloatArray] = field(default_factory=dict)
 
 
@@ -110,7 +151,10 @@ def result_of(
     or nothing decides a sweep that matters."""
     advice = MOTION if config.method == "motion" else SILHOUETTES
     weak = _weak_directions(estimate, config.observability, advice)
-    wrong = (*estimate.reasons, *(_jumps(drives) if config.check_stamps else ()))
+    jumps = StampJumps()
+    if config.check_stamps:
+        jumps = StampJumps.by_stamps(drives) if estimate.jumps is None else estimate.jumps
+    wrong, remarks = (*estimate.reasons, *jumps.reasons), (*estimate.remarks, *jumps.remarks)
     status: Status = "not_converged" if wrong else "unobservable" if estimate.open_sweeps or weak else "ok"
     qualities = quality_of(estimate.fit) | quality_of(estimate.edges_fit, EDGES_QUALITY)
     return CalibrationResult(
@@ -119,7 +163,7 @@ def result_of(
         covariance=estimate.covariance,
         status=status,
         camera=drives[0].camera,
-        reasons=(*wrong, *estimate.open_sweeps, *estimate.assumed, *reasons_of(weak), *estimate.remarks),
+        reasons=(*wrong, *estimate.open_sweeps, *estimate.assumed, *reasons_of(weak), *remarks),
         weak_directions=weak,
         frames_used=estimate.frames,
         drive_offsets=estimate.drive_offsets,
@@ -160,20 +204,6 @@ def sweeps_of(drives: Sequence[Drive]) -> dict[str, Any]:
     """Decisions about the sweeps by name of the drive, as an entry of the diagnostics."""
     found = {drive.name: drive.sweep.to_dict() for drive in drives if drive.sweep is not None}
     return {SWEEP_KEY: found} if found else {}
-
-
-def _jumps(drives: Sequence[Drive]) -> list[str]:
-    """Where the clocks of drives have jumped, so that no one time offset holds."""
-    found = []
-    for drive in drives:
-        for jump in jumps_of(drive.image_stamps_ns, drive.scan_stamps_ns):
-            image, scan = jump.place
-            frame = drive.images[image].index if jump.sensor == "image" else drive.scans[scan].index
-            found.append(
-                f"{drive.name}: {jump.sentence} at frame {frame}: "
-                "calibrate the frames before it and those from it on apart"
-            )
-    return found
 
 
 def frames_used(drives: Sequence[Drive], solution: JointSolution) -> tuple[FrameId, ...]:

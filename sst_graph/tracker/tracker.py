@@ -328,9 +328,13 @@ class Tracker:
         since = window.next_scan - scan
         if not self.estimate.exists:
             return Restart(guess, since, jump.sentence)
-        # Most likely the clock was set.
         changes = self.monitor.changes
-        before = changes.before(scan) or point
+        if changes.offset_held(scan, jump.time_offset_s, self.estimate.for_comparison()):
+            _LOG.info("tracker: %s, and the time offset has not changed", jump.sentence)
+            return None
+        # Most likely the clock was set.
+        known = changes.before(scan)
+        before = point if known is None else known.point
         near = StartGuess(before.cTl, before.time_offset_s + jump.time_offset_s, search=changes.far)
         return Restart(near, since, jump.sentence, alarm=True, chi2=jump.chi2)
 
@@ -342,6 +346,7 @@ class Tracker:
         self.monitor.restart()
         self.inputs.window.keep_scans(restart.scans)
         self.initializer.restart(restart.guess, len(self.inputs.window.scans), restart.alarm)
+        self.initializer.why = "" if restart.alarm else restart.reason
         return make_update(self, stamp_ns, restart.reason, chi2=restart.chi2, alarm=restart.alarm)
 
     def _review(self, matches: FrameMatches, stamp_ns: int, chi2: float | None) -> TrackUpdate:

@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 import pytest
 from stored import simulated
-from streets import TRACKED_STREET
+from streets import TRACKED_STREET, picked_frames
 
 from sst_graph import CalibrationConfig, open_source
 from sst_graph.batch.calibrate import calibrate_prepared, prepare_drives
@@ -28,7 +28,7 @@ from sst_graph.drive.preparation import Drive
 from sst_graph.graph.outer_loop import JointConfig, solve_joint
 from sst_graph.graph.state import State
 from sst_graph.result import CalibrationResult
-from sst_graph.simulator import SimulatedDrive, SimulationConfig
+from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
 from sst_graph.types import FloatArray, Frame, Guess, Source
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -379,3 +379,21 @@ def test_only_the_drive_that_is_wrong_is_named() -> None:
             for k, one in drives.items()
         }
         assert sorted(compare_drives(turned, False, 1e-3)[1]) == wrong
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("clock_set", [False, True])
+def test_labels_tell_a_camera_that_paused_from_a_clock_that_was_set(clock_set: bool) -> None:
+    fast = simulate(replace(STREET, frames=84, frame_rate_hz=28.95))
+    source = edited(fast, picked_frames(fast, 28, 20, clock_set))
+    config = with_overrides(CONFIG, ["decide_sweep=false"])
+    drives = prepare_drives([source], config)
+    result = calibrate_prepared(drives, fast.truth.cTl, config, initial_time_offset_s=STREET.time_offset_s)
+    (sentence,) = [reason for reason in result.reasons if "jumped by +35 ms" in reason]
+    assert "at frame 20" in sentence
+    if clock_set:
+        assert result.status == "not_converged" and "check_stamps=false" in sentence
+    else:
+        assert result.status == "ok" and "the time offset is the same" in sentence
+        error_s = result.time_offset_s - STREET.time_offset_s
+        assert abs(error_s) < 3.0 * np.sqrt(result.covariance[6, 6]) < 0.01

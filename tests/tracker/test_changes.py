@@ -15,6 +15,7 @@ from streets import (
     TRACKED_STREET,
     checkpoint_of,
     knocked,
+    picked_frames,
     sigmas_apart,
     tracker_from_truth,
     turned,
@@ -22,7 +23,7 @@ from streets import (
 
 from sst_graph import Tracker
 from sst_graph.covariance.observability import ObservabilityConfig
-from sst_graph.simulator import SimulatedDrive
+from sst_graph.simulator import SimulatedDrive, simulate
 from sst_graph.tracker.config import AlarmConfig, DriftConfig, TrackerConfig
 from sst_graph.tracker.history import HistoryEntry
 from sst_graph.tracker.monitor.confirmation import DETECTABLE_OFFSET_S, DETECTABLE_TURN_RAD, steps
@@ -168,6 +169,21 @@ def test_a_camera_clock_that_was_set_back_is_an_alarm(
     assert len(alarms) == 1 and alarms[0] < 8
     assert f"image stamps jumped by {1e3 * jump_s:+.0f} ms" in updates[alarms[0]].reason
     assert tracker.estimate.exists and abs(updates[-1].time_offset_s - 0.03 + jump_s) < 0.03
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("clock_set", [False, True])
+def test_a_camera_that_paused_is_told_from_a_clock_that_was_set(clock_set: bool) -> None:
+    """The stamps of both jump alike; what is in view is where the time offset has it, or is not."""
+    fast = simulate(dataclasses.replace(TRACKED_STREET, frames=84, frame_rate_hz=28.95))
+    tracker, alarms = _warmed_up(tracker_from_truth(fast)), []
+    for frame in picked_frames(fast, 28, STEP, clock_set):
+        update = tracker.add(frame)
+        alarms += [update] if update.alarm else []
+    assert len(alarms) == clock_set
+    if not clock_set:
+        assert update.status == "ok" and tracker.estimate.starts == 1
+        assert sigmas_apart(tracker, fast.truth.cTl, 0.03) < 3.0
 
 
 def test_a_jump_before_the_start_empties_the_window(street: SimulatedDrive, frames: list[Frame]) -> None:

@@ -318,8 +318,9 @@ class SweepWindow:
     def missed(self) -> FloatArray:
         """(pairs of scans,) chosen points of each pair that lie on no surface, by the robust kernel."""
         scale = _SCALES_M[-1]
-        near = [(1.0 / (1.0 + (rows.residuals / scale) ** 2)).sum() for rows in self._matches]
-        return np.array([len(self._surfaces[rows.scans[1]].chosen) for rows in self._matches]) - near
+        near = [float((1.0 / (1.0 + (rows.residuals / scale) ** 2)).sum()) for rows in self._matches]
+        chosen = [len(self._surfaces[rows.scans[1]].chosen) for rows in self._matches]
+        return np.array(chosen, np.float64) - near
 
     def _matched(self, a: int, b: int, posed: Sequence[_PosedScan], gate: float, scale: float) -> _Matches:
         """Points of scan b matched to surfaces of scan a."""

@@ -66,6 +66,8 @@ _WARM_UP_SCANS = 15
 """Scans after a start in which a contradiction gives up the start and is no alarm."""
 _MAX_REFUSED_STARTS = 2
 """Starts in a row that are refused because frames contradict them: the labels may have such errors."""
+_MOST_S = 0.02
+"""Largest step of the time offset that frames are asked whether they show [s]."""
 _CONFIRM_SPEED_MPS = 3.0
 """Slower than this a jump of the clock can hardly be seen: such time does not count [m/s]."""
 
@@ -359,11 +361,25 @@ class ChangeDetector:
         the new calibration may be anywhere."""
         return self._is_unmatched(CONFIRMATIONS)
 
-    def before(self, scan: int) -> Point | None:
+    def before(self, scan: int) -> Reference | None:
         """The latest estimate that was made without a scan, among those from before the latest frames."""
         known = [before for before in (self.reference, *self._before) if before is not None]
         earlier = [before for before in known if before.scan <= scan]
-        return earlier[-1].point if earlier else known[0].point if known else None
+        return (earlier[-1] if earlier else known[0]) if known else None
+
+    def offset_held(self, first: int, step_s: float, estimate: ComparedEstimate) -> bool:
+        """Whether scans from the first one on agree with the estimate before them, though they would have
+        shown a step of the time offset [s]."""
+        before = self.before(first) or Reference(estimate.point, estimate.covariance, first)
+        scans = range(first, self.matcher.window.next_scan)
+        scores = self.matcher.linearized_at(before.point, scans, _KERNEL, self._moving)
+        if not scores or self.contradicted or self.far:
+            return False
+        comparison = self.statistic.compare(scores, before.compared(estimate))
+        # A longer step leaves the range of the kernel, and is not shown in proportion.
+        step = steps(before.point.cTl, 0.0, min(abs(step_s), _MOST_S))[:, 2:]
+        agree = self.statistic.normalized(comparison) <= self.config.chi2
+        return bool(agree and self.statistic.detectable(comparison, step).all())
 
     def _note_unmatched(self, views: Mapping[int, InView], matches: Mapping[int, int]) -> None:
         for scan, view in views.items():
