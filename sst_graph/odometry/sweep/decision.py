@@ -458,8 +458,8 @@ _COARSE = 8
 _TRIED = (0.0, -1.0, 1.0)
 """Shares of the sweep that registration begins with."""
 _SURELY_WORSE = 3.0
-"""A fit that is worse by more sigmas than this is no answer. Of 54 decisions about every second to fourth ring
-of KITTI drives four were wrong by the best start alone, and one is where others count; of 96 about
+"""A fit that is worse by more sigmas than this is no answer. Of 54 decisions about every second to fourth
+ring of KITTI drives four were wrong by the best start alone, and one is where others count; of 96 about
 simulated streets, with all, half or a quarter of the rings, none changed."""
 _FEW_SCANS, _FEW_POINTS, _TRIED_ITERATIONS = 6, 60, 4
 """Scans, points of each direction of normals, and iterations for each start that is tried."""
