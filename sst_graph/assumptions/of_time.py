@@ -25,7 +25,7 @@ SKEW = Assumption(
     sigma=1e-6,
     source="synchronised clocks (PTP, GPS) drift less; free quartz clocks 2e-5",
     span=0.05,
-    violation="one clock runs faster than the other: the time offset grows",
+    violation="one clock runs faster than the other, or exposures change: the time offset grows",
     remedy="synchronise the clocks, or estimate the skew with --estimate skew",
     misleads_motion=True,
 )

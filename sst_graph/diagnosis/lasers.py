@@ -28,7 +28,7 @@ def unknown_lasers(drives: Sequence[Drive]) -> Finding | None:
         "which laser measured a point is not known and was recovered from elevations; upper edges of objects "
         "may be off by up to half the distance of two rings, beyond the sigmas",
         f"{missing} of {count_of(len(known), 'scan')} have no field 'ring', and their points come neither "
-        "ring after ring nor firing after firing",
+        "ring after ring nor firing after firing, or its numbers do not belong to the points",
         "give the clouds with the field 'ring', or as the LiDAR's driver stores them",
     )
 

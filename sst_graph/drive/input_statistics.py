@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from sst_graph.features.lidar_beams import rings_belong
 from sst_graph.features.lidar_origin import some_points
 from sst_graph.features.mask_shift import ContourProfile, contour_profiles
 from sst_graph.sampling import step_for
@@ -184,7 +185,7 @@ def scan_statistics(index: int, scan: Scan, closely: bool = True) -> ScanStatist
     labelled = _counts(scan.classes)
     digest = zlib.crc32(np.ascontiguousarray(scan.points).tobytes())
     sample = _sample(scan.points)
-    lasers = scan.rings is not None or not len(points)
+    lasers = not len(points) or (scan.rings is not None and rings_belong(points, scan.rings))
     return ScanStatistics(
         index,
         scan.stamp_ns,

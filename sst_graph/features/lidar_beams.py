@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.sampling import step_for
 from sst_graph.types import FloatArray, IntArray
 
 _CONE_NOISE_M = 0.02
@@ -38,6 +39,12 @@ _NEAREST_M, _HEIGHT_POINTS = 3.0, 20_000
 """The height is looked for with points beyond so many metres, about so many of them."""
 PARTS_OF_RINGS, STRIPS_OF_RINGS = 400, 20
 """Shares of the points that are less than a ring, and some rings, of 16 to 128."""
+_MIXED = 0.7
+"""Laser numbers that leave more of the variance of the directions than this are not those of the points. They
+leave less than 0.002 of it for spinning scanners, 0.3 to 0.4 seen from the vehicle's origin, and 0.9 or more
+where they are random."""
+_COMPARED = 10_000
+"""Points that are compared so, about."""
 _LEAST_GAP = 1e-5
 """Slopes are not told apart below this: float32 of points far away."""
 _MIN_RHO_RATIO = 1.5
@@ -79,12 +86,12 @@ def arrange_beams(points: FloatArray, rings: NDArray[np.integer] | None) -> Beam
 
     Args:
         rings: (n,) laser of each point, or None: then rings are recovered from the elevations, as seen from
-            where most cones have their tip.
+            where most cones have their tip. So they are where the numbers do not belong to the points.
     """
     rho = np.sqrt(points[:, 0] ** 2 + points[:, 1] ** 2)
     azimuth = np.arctan2(points[:, 1], points[:, 0])
     slope = points[:, 2] / np.maximum(rho, 1e-6)
-    if rings is None:
+    if rings is None or not rings_belong(points, rings):
         above = points[:, 2] - common_height(points[:, 2], rho)
         rings = recover_rings(np.arctan(above / np.maximum(rho, 1e-6)), rho)
     ring, counts, median_slope = _rank_by_slope(rings, slope)
@@ -97,6 +104,28 @@ def arrange_beams(points: FloatArray, rings: NDArray[np.integer] | None) -> Beam
     some = order[_evenly_from_each(counts)]
     height = _cone_heights(points[some, 2], rho[some], counts)
     return Beams(order, in_order, ring, azimuth, rho, height, step, np.arctan(median_slope))
+
+
+def rings_belong(points: FloatArray, rings: NDArray[np.integer]) -> bool:
+    """Whether laser numbers (n,) are those of the points (n, 3).
+
+    The directions in which one laser measures lie on a cone, and their unit vectors in a plane, whatever the
+    axes. How far off such planes they are is compared with how far off one plane all of them are.
+    """
+    step = step_for(len(points), _COMPARED)
+    some, numbers = points[::step], rings[::step]
+    if len(some) < PARTS_OF_RINGS:
+        return True
+    directions = some / np.maximum(np.linalg.norm(some, axis=1), 1e-6)[:, None]
+    ring = np.unique(numbers, return_inverse=True)[1]
+    counts = np.bincount(ring)
+    means = np.stack([np.bincount(ring, axis) for axis in directions.T], axis=1) / counts[:, None]
+    off = directions - means[ring]
+    squares = np.zeros((len(counts), 3, 3))
+    for i, j in np.ndindex(3, 3):
+        squares[:, i, j] = np.bincount(ring, off[:, i] * off[:, j])
+    within = float(np.linalg.eigvalsh(squares)[:, 0].sum()) / len(some)
+    return bool(within < _MIXED * float(np.linalg.eigvalsh(np.cov(directions.T))[0]))
 
 
 def common_height(z: FloatArray, rho: FloatArray) -> float:

@@ -89,8 +89,8 @@ class MotionSolution:
         if worst <= MAX_NOISE_SCALE:
             return None
         return (
-            f"the camera's motion fits the LiDAR's {worst:.0f} times worse than their noise allows: record a "
-            "scene with more texture that does not move, and check the stamps"
+            f"the camera's motion fits the LiDAR's {worst:.0f} times worse than their noise allows: check "
+            "the stamps, and whether frames are missing; record a scene with more texture that does not move"
         )
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import gtsam
 import numpy as np
 import pytest
 
-from sst_graph.features.lidar_beams import arrange_beams, common_height, recover_rings
+from sst_graph.features.lidar_beams import arrange_beams, common_height, recover_rings, rings_belong
 
 ELEVATIONS = np.radians([-14.0, -11.5, -9.0, -7.0, -5.0, -3.0, -1.5, 0.5])
 HEIGHTS = np.array([0.21, 0.18, 0.2, 0.15, 0.12, 0.14, 0.1, 0.11])
@@ -58,6 +59,18 @@ def test_outliers_do_not_move_the_cones() -> None:
 def test_no_height_from_a_ring_at_one_range() -> None:
     points, rank = eight_rings(low_m=20.0, high_m=25.0)
     assert not arrange_beams(points, rank).height.any()
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 90.0])
+def test_numbers_that_do_not_belong_to_the_points_are_not_believed(turn_deg: float) -> None:
+    """In any axes; lasers may be numbered in any order."""
+    points, rank = eight_rings(low_m=15.0)
+    numbers, mixed = NAMES[rank], np.random.default_rng(5).permutation(NAMES[rank])
+    turned = points @ gtsam.Rot3.Rx(np.radians(turn_deg)).matrix().T
+    assert rings_belong(turned, numbers) and not rings_belong(turned, mixed)
+    found, recovered = arrange_beams(points, mixed), arrange_beams(points, None)
+    np.testing.assert_array_equal(found.ring, recovered.ring)
+    assert rings_belong(points[:10], mixed[:10])  # too few to tell
 
 
 def test_rings_without_numbers() -> None:
