@@ -88,8 +88,7 @@ def solve_with_terms(
 
     Args:
         graph: all other factors, priors on extrinsic and offset among them; none of an earlier solution's.
-        values: start, of all variables. ``FAR_FROM_START`` measures from here, so begin where the graph has
-            its optimum without the terms.
+        values: start, of all variables.
         terms: of one camera.
         config: the schedule.
 
@@ -112,6 +111,9 @@ def solve_with_terms(
     parameters.setMaxIterations(_INNER_ITERATIONS)
     matches = match_all(terms, values, kernel_px, 1.0)
     start, alone = values, marginal(graph, values, keys)[:7, :7]
+    if np.isfinite(alone).all():
+        # What the other factors know, wherever the given values are.
+        start = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     warnings = wide_uncertainty(matches, values, alone)
     converged, rounds = False, 0
     while not converged and rounds < config.most_rounds:

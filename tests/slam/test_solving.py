@@ -85,6 +85,18 @@ def test_wide_priors_give_a_warning_and_narrow_ones_do_not(street: Street, solut
     assert narrow.warnings == () and narrow.converged
 
 
+@pytest.mark.slow
+def test_only_what_the_other_factors_know_counts_as_far(street: Street) -> None:
+    """Values may begin far from what a narrow prior says; matches that contradict it are named."""
+    far, sigmas = street.start(1), (0.005, 0.02, 0.005)
+    _, away = street.whole(far)
+    graph, _ = street.whole((street.cTl, street.time_offset_s), sigmas)
+    assert solve_with_terms(graph, away, terms_of(street)).warnings == ()
+    graph, values = street.whole(far, sigmas)
+    found = solve_with_terms(graph, values, terms_of(street)).warnings
+    assert WarningKind.FAR_FROM_START in [warning.kind for warning in found]
+
+
 def test_the_predicted_sigma_is_that_of_the_pixels(street: Street) -> None:
     _, values = street.whole((street.cTl, street.time_offset_s))
     matches = terms_of(street)[8].matched(values, 5.0)
