@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from sst_graph.batch.method_estimate import CALIBRATE_APART, StampJumps, jump_sentence, jumps_in
+from sst_graph.batch.method_estimate import jump_sentence, jumps_in
 from sst_graph.batch.part_solver import Part, PartSolver, SolvedPart
 from sst_graph.covariance.contradiction import Difference, PartEstimate, combined, name_step
 from sst_graph.drive.stamp_intervals import Jump
@@ -310,30 +310,30 @@ def _difference_document(difference: Difference) -> dict[str, Any]:
     }
 
 
-def jumps_by_labels(parts: PartSolver) -> StampJumps:
-    """The jumps of the stamps, with the frames before and after each solved by themselves.
+def held_offsets(parts: PartSolver) -> dict[str, str]:
+    """Jumps of the stamps, as sentences, before and after which the labels show the same time offset, and a
+    remark about each; the frames before and after are solved by themselves.
 
     One odd interval is a clock that was set, or a camera that paused for part of its period, or a frame that
     was picked from a faster camera one later: then the stamps are right.
     """
-    reasons, remarks = list[str](), list[str]()
+    held = dict[str, str]()
     for number, drive in enumerate(parts.drives):
-        jumps = jumps_in(drive)
+        jumps = jumps_in(drive) if parts.problem.config.check_stamps else []
         ends = [jump.place[1] for jump in jumps]
         scans = [tuple(range(a, b)) for a, b in zip([0, *ends], [*ends, len(drive.scans)], strict=True)]
         solved = [_between_jumps(parts, Part(number, own), jumps) for own in scans] if jumps else []
         for jump, before, after in zip(jumps, solved[:-1], solved[1:], strict=True):
-            sentence = jump_sentence(drive, jump)
             step_s, sigma_s = _offset_step(before, after)
-            if abs(step_s) > _AGREES * sigma_s or abs(step_s - jump.time_offset_s) < _CONTRADICTS * sigma_s:
-                reasons.append(f"{sentence}: {CALIBRATE_APART}")
-                continue
-            remarks.append(
-                f"{sentence}, but by the labels before and after it the time offset is the same (they differ "
-                f"by {1e3 * step_s:+.1f} +- {1e3 * sigma_s:.1f} ms): the sensor has paused, and its stamps "
-                "are right"
-            )
-    return StampJumps(tuple(reasons), tuple(remarks))
+            jumped = abs(step_s - jump.time_offset_s) < _CONTRADICTS * sigma_s
+            if not jumped and abs(step_s) < _AGREES * sigma_s:
+                sentence = jump_sentence(drive, jump)
+                held[sentence] = (
+                    f"{sentence}, but by the labels before and after it the time offset is the same (they "
+                    f"differ by {1e3 * step_s:+.1f} +- {1e3 * sigma_s:.1f} ms): the sensor has paused, and "
+                    "its stamps are right"
+                )
+    return held
 
 
 def _between_jumps(parts: PartSolver, part: Part, jumps: Sequence[Jump]) -> SolvedPart | None:

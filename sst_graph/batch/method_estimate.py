@@ -56,27 +56,7 @@ class DriveCovariance:
     by_static_objects: FloatArray
 
 
-@dataclass(frozen=True)
-class StampJumps:
-    """What the jumps of the stamps in some drives mean.
-
-    Attributes:
-        reasons: the jumps after which another time offset may hold.
-        remarks: those after which it is the same, as the labels show.
-    """
-
-    reasons: tuple[str, ...] = ()
-    remarks: tuple[str, ...] = ()
-
-    @classmethod
-    def by_stamps(cls, drives: Sequence[Drive]) -> StampJumps:
-        """By the stamps alone: any jump may be a clock that was set."""
-        return cls(
-            tuple(f"{jump_sentence(d, jump)}: {CALIBRATE_APART}" for d in drives for jump in jumps_in(d))
-        )
-
-
-CALIBRATE_APART = (
+_CALIBRATE_APART = (
     "calibrate the frames before it and those from it on apart, or, of a sensor without a steady rate, use "
     "--set check_stamps=false"
 )
@@ -117,7 +97,8 @@ class MethodEstimate:
         by_sweeps: (7, 7) part of the covariance by sweeps that the scans leave undecided.
         open_sweeps: that such sweeps matter, which makes the status ``unobservable``.
         shared: errors that other cameras on the LiDAR have, too, of methods without ``solved``.
-        jumps: of the stamps, by methods that compare the labels before and after them.
+        held_offsets: by :func:`jump_sentence`, jumps of the stamps before and after which the labels show the
+            same time offset, and a remark that says so.
         assumption_steps: (7,) step of the estimate by one deviation of each assumption that is considered in
             the covariance, by name.
     """
@@ -140,7 +121,7 @@ class MethodEstimate:
     by_sweeps: FloatArray = field(default_factory=lambda: np.zeros((7, 7)))
     open_sweeps: tuple[str, ...] = ()
     shared: SharedErrors | None = None
-    jumps: StampJumps | None = None
+    held_offsets: Mapping[str, str] = field(default_factory=dict)
     assumption_steps: Mapping[str, FloatArray] = field(default_factory=dict)
 
 
@@ -151,10 +132,12 @@ def result_of(
     or nothing decides a sweep that matters."""
     advice = MOTION if config.method == "motion" else SILHOUETTES
     weak = _weak_directions(estimate, config.observability, advice)
-    jumps = StampJumps()
+    jumps = [jump_sentence(drive, jump) for drive in drives for jump in jumps_in(drive)]
+    held = estimate.held_offsets
+    wrong, remarks = [*estimate.reasons], [*estimate.remarks]
     if config.check_stamps:
-        jumps = StampJumps.by_stamps(drives) if estimate.jumps is None else estimate.jumps
-    wrong, remarks = (*estimate.reasons, *jumps.reasons), (*estimate.remarks, *jumps.remarks)
+        wrong += [f"{jump}: {_CALIBRATE_APART}" for jump in jumps if jump not in held]
+        remarks += [held[jump] for jump in jumps if jump in held]
     status: Status = "not_converged" if wrong else "unobservable" if estimate.open_sweeps or weak else "ok"
     qualities = quality_of(estimate.fit) | quality_of(estimate.edges_fit, EDGES_QUALITY)
     return CalibrationResult(
