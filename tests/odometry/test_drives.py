@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -11,8 +12,10 @@ import pytest
 from numpy.typing import NDArray
 
 from sst_graph.data import open_source
+from sst_graph.drive.geometric_labels import labelled_by_geometry
 from sst_graph.odometry.lidar import lidar_odometry
 from sst_graph.odometry.standstill import standstill_frames
+from sst_graph.odometry.sweep import decide_sweep
 from sst_graph.odometry.visual import image_pairs, metric_motions
 from sst_graph.types import CameraImage, RelativeMotion, Scan, Source
 
@@ -95,3 +98,27 @@ def test_lidar_motion(name: str) -> None:
     true = lengths_of(reference_steps(file if file.exists() else folder / "poses.txt"))
     assert np.median(np.abs(steps - true)) < np.maximum(0.005, 0.01 * np.median(true))
     assert abs(np.mean(steps - true)) < 0.003
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("every", "first", "by_geometry"), [(3, 1, False), (4, 0, True), (4, 3, True)])
+def test_the_sweep_that_few_rings_show(every: int, first: int, by_geometry: bool) -> None:
+    """Under some shares of a sweep that is not there their points meet nearly as well."""
+    source = open_source(drive(PARKED))
+
+    def scan(k: int) -> Scan:
+        whole = source[k].scan
+        assert whole is not None and whole.rings is not None and whole.instances is not None
+        kept = whole.rings % every == first
+        few = replace(
+            whole,
+            points=whole.points[kept],
+            classes=whole.classes[kept],
+            instances=whole.instances[kept],
+            rings=whole.rings[kept],
+            offsets_s=None,
+        )
+        return labelled_by_geometry(few) if by_geometry else few
+
+    found = decide_sweep(scan, len(source))
+    assert found.kind in ("compensated", "undecided"), found.sentence

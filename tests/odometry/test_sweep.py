@@ -195,7 +195,7 @@ def _hall(
     [
         (0.0, 180.0, 0.0, 180.0, "compensated"),
         (-1.0, 180.0, 0.0, 180.0, "clockwise"),
-        (1.0, 120.0, 0.0, 180.0, "counterclockwise"),
+        pytest.param(1.0, 120.0, 0.0, 180.0, "counterclockwise", marks=pytest.mark.slow),
         (1.0, 180.0, 0.3, 70.0, "counterclockwise"),
     ],
 )
@@ -412,7 +412,11 @@ class Hall:
 
 @pytest.mark.parametrize(
     ("fraction", "said", "instead"),
-    [(-1.0, "compensated", "clockwise"), (0.0, "azimuth", "compensated"), (-1.0, "clockwise", "")],
+    [
+        (-1.0, "compensated", "clockwise"),
+        pytest.param(0.0, "azimuth", "compensated", marks=pytest.mark.slow),
+        pytest.param(-1.0, "clockwise", "", marks=pytest.mark.slow),
+    ],
 )
 def test_what_is_said_of_the_sweep_is_compared_with_the_scans(
     fraction: float, said: str, instead: str
@@ -435,7 +439,10 @@ def test_what_is_said_of_the_sweep_is_compared_with_the_scans(
     assert any(decision.contradiction in reason for reason in checked.reasons[:1]) == bool(instead)
 
 
-@pytest.mark.parametrize(("fraction", "in_part"), [(-1.0, False), (0.0, False), (1.0, False), (-0.5, True)])
+@pytest.mark.parametrize(
+    ("fraction", "in_part"),
+    [(-0.5, True), *(pytest.param(f, False, marks=pytest.mark.slow) for f in (-1.0, 0.0, 1.0))],
+)
 def test_points_that_were_moved_by_half_of_the_motion_contradict_every_hypothesis(
     fraction: float, in_part: bool
 ) -> None:
@@ -466,11 +473,27 @@ class TimedHall(Hall):
     [
         (-1.0, -1.0, ""),
         (0.0, -1.0, "the times of the points say clockwise, the scans compensated ("),  # and the times kept
-        (-1.0, 1.0, "the times of the points say counterclockwise, the scans clockwise ("),
         (-1.0, -2.0, "the times of the points say clockwise, 0.2 s a turn, the scans clockwise ("),
-        (-1.0, 0.0, "the times of the points say compensated, the scans clockwise ("),
-        (-0.5, -1.0, "the times of the points say clockwise, the scans another sweep ("),
-        (-0.5, -0.5, ""),  # every second scan of a LiDAR that turns twice as fast
+        pytest.param(
+            -1.0,
+            1.0,
+            "the times of the points say counterclockwise, the scans clockwise (",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            -1.0,
+            0.0,
+            "the times of the points say compensated, the scans clockwise (",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            -0.5,
+            -1.0,
+            "the times of the points say clockwise, the scans another sweep (",
+            marks=pytest.mark.slow,
+        ),
+        # Every second scan of a LiDAR that turns twice as fast.
+        pytest.param(-0.5, -0.5, "", marks=pytest.mark.slow),
     ],
 )
 def test_times_of_the_points_are_compared_with_the_scans(fraction: float, told: float, wrong: str) -> None:
