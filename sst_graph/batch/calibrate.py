@@ -24,7 +24,7 @@ from sst_graph.batch.by_edges.lens import lens_beside_labels
 from sst_graph.batch.by_edges.method import edges_method
 from sst_graph.batch.causes import with_causes
 from sst_graph.batch.config import CalibrationConfig, Method, prepared_classes
-from sst_graph.batch.contradictions import Contradictions, find_contradictions, held_offsets
+from sst_graph.batch.contradictions import Contradictions, find_contradictions, offsets_held_by_labels
 from sst_graph.batch.joint_report import (
     assumed_motion,
     fit_of,
@@ -220,7 +220,7 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
     problem, solutions = replace(problem, config=config), lower.solutions
     # 4. Consistency: drives against each other; stretches of a drive, and both sides of a jump of its stamps.
     parts = PartSolver(problem, solutions[0].state)
-    contradictions, held = find_contradictions(parts), held_offsets(parts)
+    contradictions, held = find_contradictions(parts), offsets_held_by_labels(parts)
     # 5. Cluster-robust covariance; motion as a factor where the labels determine all unknowns.
     labels_alone = JointEstimate.of(solutions[0], problem.objects)
     motion = with_motion(problem, labels_alone, contradictions.stretches)

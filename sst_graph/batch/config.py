@@ -93,7 +93,7 @@ class CalibrationConfig(Settings):
     for_report: bool = internal(True)
     check_stamps: bool = setting(
         True,
-        doc="Report a result as not converged where a sensor's stamps jump, unless the labels before and "
+        doc="Report a result as not converged where a sensor's stamps jump, unless the frames before and "
         "after show one time offset. Set to false for sensors without a steady rate.",
     )
     find_causes: bool = setting(

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from sst_graph.batch.method_estimate import jump_sentence, jumps_in
+from sst_graph.batch.method_estimate import held_offsets
 from sst_graph.batch.part_solver import Part, PartSolver, SolvedPart
 from sst_graph.covariance.contradiction import Difference, PartEstimate, combined, name_step
 from sst_graph.drive.stamp_intervals import Jump
@@ -30,11 +30,6 @@ _MOST_STRETCHES = 8
 """Stretches that a drive is cut into: each costs a solution of its scans."""
 _LEAST_SCANS = 4
 """Fewest scans of a stretch: fewer seldom determine an estimate."""
-
-
-_AGREES, _CONTRADICTS = 3.0, 4.0
-"""After a jump the stamps are right where the time offset has changed by fewer sigmas than the first, and
-differs from the jump by more than the second."""
 
 
 @dataclass(frozen=True)
@@ -310,30 +305,16 @@ def _difference_document(difference: Difference) -> dict[str, Any]:
     }
 
 
-def held_offsets(parts: PartSolver) -> dict[str, str]:
-    """Jumps of the stamps, as sentences, before and after which the labels show the same time offset, and a
-    remark about each; the frames before and after are solved by themselves.
+def offsets_held_by_labels(parts: PartSolver) -> dict[str, str]:
+    """:func:`held_offsets` with the frames before and after each jump solved by themselves."""
 
-    One odd interval is a clock that was set, or a camera that paused for part of its period, or a frame that
-    was picked from a faster camera one later: then the stamps are right.
-    """
-    held = dict[str, str]()
-    for number, drive in enumerate(parts.drives):
-        jumps = jumps_in(drive) if parts.problem.config.check_stamps else []
+    def solved(number: int, jumps: Sequence[Jump]) -> list[PartEstimate | None]:
         ends = [jump.place[1] for jump in jumps]
-        scans = [tuple(range(a, b)) for a, b in zip([0, *ends], [*ends, len(drive.scans)], strict=True)]
-        solved = [_between_jumps(parts, Part(number, own), jumps) for own in scans] if jumps else []
-        for jump, before, after in zip(jumps, solved[:-1], solved[1:], strict=True):
-            step_s, sigma_s = _offset_step(before, after)
-            jumped = abs(step_s - jump.time_offset_s) < _CONTRADICTS * sigma_s
-            if not jumped and abs(step_s) < _AGREES * sigma_s:
-                sentence = jump_sentence(drive, jump)
-                held[sentence] = (
-                    f"{sentence}, but by the labels before and after it the time offset is the same (they "
-                    f"differ by {1e3 * step_s:+.1f} +- {1e3 * sigma_s:.1f} ms): the sensor has paused, and "
-                    "its stamps are right"
-                )
-    return held
+        bounds = zip([0, *ends], [*ends, len(parts.drives[number].scans)], strict=True)
+        found = [_between_jumps(parts, Part(number, tuple(range(a, b))), jumps) for a, b in bounds]
+        return [None if part is None else part.step for part in found]
+
+    return held_offsets(parts.drives, parts.problem.config, solved, "the labels")
 
 
 def _between_jumps(parts: PartSolver, part: Part, jumps: Sequence[Jump]) -> SolvedPart | None:
@@ -343,13 +324,3 @@ def _between_jumps(parts: PartSolver, part: Part, jumps: Sequence[Jump]) -> Solv
     offset_s = reference.time_offsets_s[0]
     starts = [replace(reference, time_offsets_s=(offset_s + shift_s,)) for shift_s in shifts_s]
     return parts.solve_from(part, parts.best_start(part, starts)) if part.scans else None
-
-
-def _offset_step(before: SolvedPart | None, after: SolvedPart | None) -> tuple[float, float]:
-    """By how much the time offset changes from one part to another with the same extrinsic, and its standard
-    deviation [s]; infinite where one of them has no estimate."""
-    if before is None or after is None:
-        return 0.0, np.inf
-    found = Difference.of(before.step, after.step)
-    weights = np.linalg.inv(found.covariance)[6]
-    return float(weights @ found.step / weights[6]), float(1.0 / np.sqrt(weights[6]))

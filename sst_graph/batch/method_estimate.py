@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +13,7 @@ import numpy as np
 
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.config import to_dict
+from sst_graph.covariance.contradiction import Difference, PartEstimate
 from sst_graph.covariance.observability import (
     MOTION,
     SILHOUETTES,
@@ -35,6 +36,9 @@ from sst_graph.types import FloatArray, Guess
 if TYPE_CHECKING:
     from sst_graph.batch.problem import JointOutcome, MatchedDrives
 
+_AGREES, _CONTRADICTS = 3.0, 4.0
+"""After a jump the stamps are right where the time offset has changed by fewer sigmas than the first, and
+differs from the jump by more than the second."""
 UNKNOWN_SIGMAS = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
 """(7,) deviations of what is not known at all [rad, m, s]."""
 PACKAGES = ("sst-graph", "gtsam", "numpy", "scipy", "small_gicp")
@@ -57,8 +61,8 @@ class DriveCovariance:
 
 
 _CALIBRATE_APART = (
-    "calibrate the frames before it and those from it on apart, or, of a sensor without a steady rate, use "
-    "--set check_stamps=false"
+    "calibrate the frames before and from there apart, or use --set check_stamps=false if the sensor has no "
+    "steady rate"
 )
 """Advice for a jump of the stamps."""
 
@@ -72,7 +76,45 @@ def jump_sentence(drive: Drive, jump: Jump) -> str:
     """Where a jump is, and how large."""
     image, scan = jump.place
     frame = drive.images[image].index if jump.sensor == "image" else drive.scans[scan].index
-    return f"{drive.name}: {jump.sentence} at frame {frame}"
+    return f"{drive.name}: at frame {frame} {jump.sentence}"
+
+
+def held_offsets(
+    drives: Sequence[Drive],
+    config: CalibrationConfig,
+    estimates: Callable[[int, Sequence[Jump]], Sequence[PartEstimate | None]],
+    source: str,
+) -> dict[str, str]:
+    """Jumps of the stamps, by :func:`jump_sentence`, before and after which the time offset is the same, and
+    a remark about each.
+
+    One odd interval is a clock that was set, or a camera that paused for part of its period, or a frame that
+    was picked from a faster camera one later: then the stamps are right.
+
+    Args:
+        estimates: of a drive's number and its jumps: the estimates of the frames before, between and behind
+            these by themselves, None where there is none; they have one extrinsic.
+        source: of these estimates.
+    """
+    held = {}
+    for number, drive in enumerate(drives):
+        jumps = jumps_in(drive) if config.check_stamps else []
+        parts = estimates(number, jumps) if jumps else []
+        for jump, before, after in zip(jumps, parts[:-1], parts[1:], strict=True):
+            if before is None or after is None:
+                continue
+            found = Difference.of(before, after)
+            weights = np.linalg.inv(found.covariance)[6]
+            step_s, sigma_s = float(weights @ found.step / weights[6]), float(1.0 / np.sqrt(weights[6]))
+            jumped = abs(step_s - jump.time_offset_s) < _CONTRADICTS * sigma_s
+            if not jumped and abs(step_s) < _AGREES * sigma_s:
+                sentence = jump_sentence(drive, jump)
+                held[sentence] = (
+                    f"{sentence}, but by {source} the time offset is the same before and after it (they "
+                    f"differ by {1e3 * step_s:+.1f} +- {1e3 * sigma_s:.1f} ms): the sensor has paused, and "
+                    "its stamps are right"
+                )
+    return held
 
 
 @dataclass(frozen=True)
@@ -97,8 +139,7 @@ class MethodEstimate:
         by_sweeps: (7, 7) part of the covariance by sweeps that the scans leave undecided.
         open_sweeps: that such sweeps matter, which makes the status ``unobservable``.
         shared: errors that other cameras on the LiDAR have, too, of methods without ``solved``.
-        held_offsets: by :func:`jump_sentence`, jumps of the stamps before and after which the labels show the
-            same time offset, and a remark that says so.
+        held_offsets: as of :func:`held_offsets`, by methods that compare the frames before and after jumps.
         assumption_steps: (7,) step of the estimate by one deviation of each assumption that is considered in
             the covariance, by name.
     """

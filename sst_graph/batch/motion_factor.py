@@ -10,10 +10,12 @@ import numpy as np
 
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.contradictions import FALSE_ALARM
+from sst_graph.batch.method_estimate import held_offsets
 from sst_graph.batch.part_solver import PartSolver, SolvedPart
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.covariance.contradiction import Difference, PartEstimate, name_step
 from sst_graph.drive.preparation import Drive
+from sst_graph.drive.stamp_intervals import Jump
 from sst_graph.errors import EstimationError
 from sst_graph.graph.known import KnownCalibration, motion_steps
 from sst_graph.graph.outer_loop import KERNELS_PX, solve_joint
@@ -184,3 +186,52 @@ def _contradiction(step: FloatArray, chi2: float, motion: MotionSolution) -> tup
         f"motion alone gives another calibration, {degrees:.2f} deg, {100 * metres:.0f} cm and "
         f"{1e3 * step[6]:+.1f} ms away (chi-squared {chi2:.0f} of 7): labels or odometry are wrong",
     )
+
+
+def offsets_held_by_motion(
+    drives: Sequence[Drive], state: State, config: CalibrationConfig
+) -> dict[str, str]:
+    """:func:`~sst_graph.batch.method_estimate.held_offsets` by motion alone.
+
+    Args:
+        state: estimate of all frames.
+    """
+
+    def solved(number: int, jumps: Sequence[Jump]) -> list[PartEstimate | None]:
+        drive, own = drives[number], State(state.cTl, (state.time_offset_s(number),))
+        return [_by_motion(part, own, config) for part in _between_jumps(drive, jumps)]
+
+    return held_offsets(drives, config, solved, "the motion")
+
+
+def _between_jumps(drive: Drive, jumps: Sequence[Jump]) -> list[Drive]:
+    """The drive with the motions of the sensors before, between and behind jumps of their stamps."""
+    parts = []
+    for k in range(len(jumps) + 1):
+        part = drive
+        for jump, later in [(jump, False) for jump in jumps[k:]] + [(jump, True) for jump in jumps[:k]]:
+            image, scan = jump.place
+            if jump.sensor == "image":
+                at = drive.images[image].stamp_ns
+                kept = [(pair, pair.tracks.from_ns, pair.tracks.to_ns) for pair in part.image_pairs]
+                pairs = tuple(pair for pair, a, b in kept if (a >= at if later else b < at))
+                part = replace(part, image_pairs=pairs)
+            else:
+                at = drive.scans[scan].stamp_ns
+                motions = tuple(
+                    each for each in part.lidar_motions if (each.from_ns >= at if later else each.to_ns < at)
+                )
+                part = replace(part, lidar_motions=motions)
+        parts.append(part)
+    return parts
+
+
+def _by_motion(part: Drive, state: State, config: CalibrationConfig) -> PartEstimate | None:
+    """A part's own estimate by motion, as a step from a state; None where it has none."""
+    try:
+        found = solve_motion([part], Guess(*state.calibration()), config.search.time_offset_s)[0]
+    except EstimationError:
+        return None
+    if not found.converged or found.misfit is not None:
+        return None
+    return PartEstimate(difference(state, found.state), found.covariance)

@@ -9,6 +9,7 @@ import numpy as np
 from sst_graph.batch.by_edges.problem import problem_of_some_frames, with_fewer_points
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import MethodEstimate
+from sst_graph.batch.motion_factor import offsets_held_by_motion
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.fit import Fit
 from sst_graph.graph.outer_loop import still_moved
@@ -48,6 +49,7 @@ def motion_method(
             "turned_deg": _turned_deg(best),
             KEY: to_document(gained),
         },
+        held_offsets=offsets_held_by_motion(drives, best.state, config),
         fit=check_by_edges(drives, guess, config, best) if config.for_report else None,
     )
 

@@ -29,6 +29,7 @@ from sst_graph.batch.by_edges.reasons import (
 )
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import MethodEstimate, frames_used
+from sst_graph.batch.motion_factor import offsets_held_by_motion
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate, MatchedDrives
 from sst_graph.batch.total_covariance import sweep_effects
 from sst_graph.drive.preparation import Drive, Progress
@@ -113,6 +114,7 @@ def edges_method(
         open_sweeps=sweeps.reasons,
         shared=own.shared,
         assumption_steps=own.assumption_steps,
+        held_offsets=offsets_held_by_motion(drives, solution.state, config),
     )
 
 
