@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import gtsam
 import numpy as np
 
-from sst_graph.drive.preparation import Drive, ImageFeatures
+from sst_graph.drive.preparation import Drive, ImageFeatures, ScanFeatures
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.odometry.features import Tracks as ImageTracks
 from sst_graph.odometry.relative import DirectionMotion
@@ -46,12 +47,16 @@ def made_drive(
     noise: float = 1.0,
     yaw_noise: float = 1.0,
     lidar_noise: float = 1.0,
+    late_ns: Sequence[int] = (0,),
+    clock_set: bool = False,
 ) -> Drive:
     """Odometry of both sensors under known noise; the LiDAR's poses err, not its steps.
 
     Args:
         lidar_noise: factor on the noise of the LiDAR alone, of which the odometry does not know.
         yaw_noise: factor on the LiDAR's noise about its z axis, of which the odometry does not know.
+        late_ns: by how much the stamps of the images are later than the scans', in equal stretches.
+        clock_set: the images themselves are not: the camera's clock was set.
     """
     rng = np.random.default_rng(seed)
     sigmas = noise * lidar_noise * np.repeat([SIGMA_RAD, SIGMA_M], 3)
@@ -62,10 +67,18 @@ def made_drive(
         RelativeMotion(a, b, p.between(q), np.diag(2.0 * np.repeat([SIGMA_RAD, SIGMA_M], 3) ** 2))
         for a, b, p, q in zip(stamps, stamps[1:], poses, poses[1:], strict=False)
     )
-    camera = tuple(_image_pair(a, b, wTl, rng, noise) for a, b in pairwise(stamps))
-    blank = np.zeros((1, 1), np.uint8)
-    images = tuple(ImageFeatures(k, stamp, blank, {}) for k, stamp in enumerate(stamps))
-    return Drive("made", PinholeCamera(700, 700, 600, 180, 1242, 375), (), images, lidar, camera)
+    shown = [stamp + late_ns[len(late_ns) * k // frames] for k, stamp in enumerate(stamps)]
+    taken = stamps if clock_set else shown
+    camera = [_image_pair(a, b, wTl, rng, noise) for a, b in pairwise(taken)]
+    camera = [
+        replace(pair, tracks=replace(pair.tracks, from_ns=a, to_ns=b))
+        for pair, (a, b) in zip(camera, pairwise(shown), strict=True)
+    ]
+    blank, none = np.zeros((1, 1), np.uint8), np.zeros((0, 3))
+    images = tuple(ImageFeatures(k, stamp, blank, {}) for k, stamp in enumerate(shown))
+    empty = none, np.zeros(0, np.uint8), none[:, 0], none.astype(np.float32), none[:, 0].astype(np.float32)
+    scans = tuple(ScanFeatures(k, stamp, {}, *empty) for k, stamp in enumerate(stamps))
+    return Drive("made", PinholeCamera(700, 700, 600, 180, 1242, 375), scans, images, lidar, tuple(camera))
 
 
 def _image_pair(a: int, b: int, wTl: PoseAt, rng: np.random.Generator, noise: float) -> ImagePair:

@@ -14,6 +14,8 @@ from stored import written
 from streets import standing_street
 
 from sst_graph.batch import CalibrationConfig, calibrate, calibrate_prepared
+from sst_graph.batch.method_estimate import jump_sentence, jumps_in
+from sst_graph.batch.motion_factor import offsets_held_by_motion
 from sst_graph.cli import main
 from sst_graph.config import with_overrides
 from sst_graph.data import open_source
@@ -102,6 +104,21 @@ def test_noise_of_the_lidar_does_not_draw_the_offset_to_its_stamps(lidar_noise: 
         drive = made_drive(gentle, 30, seed, lidar_noise=lidar_noise)
         errors.append(1e3 * error_of(solve_motion([drive], Guess(TRUE, OFFSET_S))[0])[6])
     assert abs(np.mean(errors)) < 1.0
+
+
+@pytest.mark.parametrize("clock_set", [False, True])
+def test_motion_tells_a_camera_that_paused_from_a_clock_that_was_set(clock_set: bool) -> None:
+    """Twice; the motions between two parts belong to neither."""
+    drive = made_drive(weaving, 90, late_ns=(0, 34_000_000, 68_000_000), clock_set=clock_set)
+    jumps = jumps_in(drive)
+    assert [round(1e3 * jump.seconds) for jump in jumps] == [34, 34]
+    held = offsets_held_by_motion([drive], State(TRUE, (OFFSET_S,)), CalibrationConfig())
+    sentences = [] if clock_set else [jump_sentence(drive, jump) for jump in jumps]
+    assert [*held] == sentences
+    assert all("by the motion the time offset is the same" in remark for remark in held.values())
+    assert not offsets_held_by_motion(
+        [drive], State(TRUE, (OFFSET_S,)), CalibrationConfig(check_stamps=False)
+    )
 
 
 def test_noise_is_no_turning() -> None:
