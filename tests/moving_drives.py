@@ -49,6 +49,7 @@ def made_drive(
     lidar_noise: float = 1.0,
     late_ns: Sequence[int] = (0,),
     clock_set: bool = False,
+    scans_late: tuple[int, int, int] = (0, 0, 0),
 ) -> Drive:
     """Odometry of both sensors under known noise; the LiDAR's poses err, not its steps.
 
@@ -57,15 +58,19 @@ def made_drive(
         yaw_noise: factor on the LiDAR's noise about its z axis, of which the odometry does not know.
         late_ns: by how much the stamps of the images are later than the scans', in equal stretches.
         clock_set: the images themselves are not: the camera's clock was set.
+        scans_late: from which scan on the scanner is late, and its clock ahead, by how much [ns].
     """
     rng = np.random.default_rng(seed)
     sigmas = noise * lidar_noise * np.repeat([SIGMA_RAD, SIGMA_M], 3)
     sigmas[2] *= yaw_noise
     stamps = [round(k * PERIOD_S * 1e9) for k in range(frames)]
-    poses = [wTl(s * 1e-9).retract(sigmas * rng.standard_normal(6)) for s in stamps]
+    first, pause_ns, ahead_ns = scans_late
+    measured = [stamp + (pause_ns if k >= first else 0) for k, stamp in enumerate(stamps)]
+    stamped = [stamp + (ahead_ns if k >= first else 0) for k, stamp in enumerate(measured)]
+    poses = [wTl(s * 1e-9).retract(sigmas * rng.standard_normal(6)) for s in measured]
     lidar = tuple(
         RelativeMotion(a, b, p.between(q), np.diag(2.0 * np.repeat([SIGMA_RAD, SIGMA_M], 3) ** 2))
-        for a, b, p, q in zip(stamps, stamps[1:], poses, poses[1:], strict=False)
+        for a, b, p, q in zip(stamped, stamped[1:], poses, poses[1:], strict=False)
     )
     shown = [stamp + late_ns[len(late_ns) * k // frames] for k, stamp in enumerate(stamps)]
     taken = stamps if clock_set else shown
@@ -77,7 +82,7 @@ def made_drive(
     blank, none = np.zeros((1, 1), np.uint8), np.zeros((0, 3))
     images = tuple(ImageFeatures(k, stamp, blank, {}) for k, stamp in enumerate(shown))
     empty = none, np.zeros(0, np.uint8), none[:, 0], none.astype(np.float32), none[:, 0].astype(np.float32)
-    scans = tuple(ScanFeatures(k, stamp, {}, *empty) for k, stamp in enumerate(stamps))
+    scans = tuple(ScanFeatures(k, stamp, {}, *empty) for k, stamp in enumerate(stamped))
     return Drive("made", PinholeCamera(700, 700, 600, 180, 1242, 375), scans, images, lidar, tuple(camera))
 
 

@@ -111,8 +111,8 @@ def held_offsets(
                 sentence = jump_sentence(drive, jump)
                 held[sentence] = (
                     f"{sentence}, but by {source} the time offset is the same before and after it (they "
-                    f"differ by {1e3 * step_s:+.1f} +- {1e3 * sigma_s:.1f} ms): the sensor has paused, and "
-                    "its stamps are right"
+                    f"differ by {1e3 * step_s:+.1f} +- {1e3 * sigma_s:.1f} ms): the stamps are right, and "
+                    "the sensor has paused, or frames were picked from a faster one"
                 )
     return held
 

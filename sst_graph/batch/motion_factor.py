@@ -20,7 +20,7 @@ from sst_graph.errors import EstimationError
 from sst_graph.graph.known import KnownCalibration, motion_steps
 from sst_graph.graph.outer_loop import KERNELS_PX, solve_joint
 from sst_graph.graph.state import State, difference, nuisance_key
-from sst_graph.hand_eye.solution import MotionSolution, solve_motion
+from sst_graph.hand_eye.solution import MotionSolution, alternative, solve_motion
 from sst_graph.types import FloatArray, Guess
 
 MAX_DISAGREEMENT_CHI2 = 40.0
@@ -199,39 +199,58 @@ def offsets_held_by_motion(
 
     def solved(number: int, jumps: Sequence[Jump]) -> list[PartEstimate | None]:
         drive, own = drives[number], State(state.cTl, (state.time_offset_s(number),))
-        return [_by_motion(part, own, config) for part in _between_jumps(drive, jumps)]
+        parts = _between_jumps(drive, jumps, config.search.time_offset_s)
+        return [_by_motion(part, own, config) for part in parts]
 
     return held_offsets(drives, config, solved, "the motion")
 
 
-def _between_jumps(drive: Drive, jumps: Sequence[Jump]) -> list[Drive]:
-    """The drive with the motions of the sensors before, between and behind jumps of their stamps."""
-    parts = []
-    for k in range(len(jumps) + 1):
-        part = drive
-        for jump, later in [(jump, False) for jump in jumps[k:]] + [(jump, True) for jump in jumps[:k]]:
-            image, scan = jump.place
-            if jump.sensor == "image":
-                at = drive.images[image].stamp_ns
-                kept = [(pair, pair.tracks.from_ns, pair.tracks.to_ns) for pair in part.image_pairs]
-                pairs = tuple(pair for pair, a, b in kept if (a >= at if later else b < at))
-                part = replace(part, image_pairs=pairs)
-            else:
-                at = drive.scans[scan].stamp_ns
-                motions = tuple(
-                    each for each in part.lidar_motions if (each.from_ns >= at if later else each.to_ns < at)
-                )
-                part = replace(part, lidar_motions=motions)
-        parts.append(part)
-    return parts
+def _between_jumps(drive: Drive, jumps: Sequence[Jump], margin_s: float) -> list[Drive]:
+    """The drive with the motions of the sensors before, between and behind jumps of their stamps.
+
+    Args:
+        margin_s: by how much stamps of the other sensor may be off.
+    """
+    ends = [
+        (
+            jump.sensor,
+            (drive.images[jump.place[0]] if jump.sensor == "image" else drive.scans[jump.place[1]]).stamp_ns,
+        )
+        for jump in jumps
+    ]
+    margin_ns = round(1e9 * margin_s)
+
+    def kept(sensor: str, from_ns: int, to_ns: int, part: int) -> bool:
+        """Whether a motion of a sensor lies in a part, or may do so by the other sensor's stamps."""
+        for k, (jumped, at_ns) in enumerate(ends):
+            more_ns = 0 if jumped == sensor else margin_ns
+            if (k >= part and to_ns >= at_ns + more_ns) or (k < part and from_ns < at_ns - more_ns):
+                return False
+        return True
+
+    return [
+        replace(
+            drive,
+            image_pairs=tuple(
+                pair
+                for pair in drive.image_pairs
+                if kept("image", pair.tracks.from_ns, pair.tracks.to_ns, part)
+            ),
+            lidar_motions=tuple(
+                motion for motion in drive.lidar_motions if kept("scan", motion.from_ns, motion.to_ns, part)
+            ),
+        )
+        for part in range(len(ends) + 1)
+    ]
 
 
 def _by_motion(part: Drive, state: State, config: CalibrationConfig) -> PartEstimate | None:
     """A part's own estimate by motion, as a step from a state; None where it has none."""
     try:
-        found = solve_motion([part], Guess(*state.calibration()), config.search.time_offset_s)[0]
-    except EstimationError:
+        solutions = solve_motion([part], Guess(*state.calibration()), config.search.time_offset_s)
+    except (EstimationError, np.linalg.LinAlgError):
         return None
-    if not found.converged or found.misfit is not None:
+    found = solutions[0]
+    if not found.converged or found.misfit is not None or alternative(solutions) is not None:
         return None
     return PartEstimate(difference(state, found.state), found.covariance)

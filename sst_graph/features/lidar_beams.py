@@ -41,10 +41,12 @@ PARTS_OF_RINGS, STRIPS_OF_RINGS = 400, 20
 """Shares of the points that are less than a ring, and some rings, of 16 to 128."""
 _MIXED = 0.7
 """Laser numbers that leave more of the variance of the directions than this are not those of the points. They
-leave less than 0.002 of it for spinning scanners, 0.3 to 0.4 seen from the vehicle's origin, and 0.9 or more
+leave less than 0.005 of it for spinning scanners, 0.2 to 0.55 seen from the vehicle's origin, and 0.9 or more
 where they are random."""
-_COMPARED = 10_000
-"""Points that are compared so, about."""
+_COMPARED, _LEAST_RANGE_M = 10_000, 0.5
+"""Points that are compared so, about, and how far away they are: returns that were lost are at the origin."""
+_FLAT = 1e-6
+"""Variance of directions across a plane, of a milliradian, in which all lie."""
 _LEAST_GAP = 1e-5
 """Slopes are not told apart below this: float32 of points far away."""
 _MIN_RHO_RATIO = 1.5
@@ -112,11 +114,15 @@ def rings_belong(points: FloatArray, rings: NDArray[np.integer]) -> bool:
     The directions in which one laser measures lie on a cone, and their unit vectors in a plane, whatever the
     axes. How far off such planes they are is compared with how far off one plane all of them are.
     """
-    step = step_for(len(points), _COMPARED)
-    some, numbers = points[::step], rings[::step]
+    # An odd step: columns of a file have an even number of lasers.
+    some = points[:: step_for(len(points), _COMPARED) | 1]
+    numbers = rings[:: step_for(len(points), _COMPARED) | 1]
+    ranges = np.linalg.norm(some, axis=1)
+    seen = np.isfinite(ranges) & (ranges > _LEAST_RANGE_M)
+    some, numbers, ranges = some[seen], numbers[seen], ranges[seen]
     if len(some) < PARTS_OF_RINGS:
         return True
-    directions = some / np.maximum(np.linalg.norm(some, axis=1), 1e-6)[:, None]
+    directions = some / ranges[:, None]
     ring = np.unique(numbers, return_inverse=True)[1]
     counts = np.bincount(ring)
     means = np.stack([np.bincount(ring, axis) for axis in directions.T], axis=1) / counts[:, None]
@@ -125,7 +131,9 @@ def rings_belong(points: FloatArray, rings: NDArray[np.integer]) -> bool:
     for i, j in np.ndindex(3, 3):
         squares[:, i, j] = np.bincount(ring, off[:, i] * off[:, j])
     within = float(np.linalg.eigvalsh(squares)[:, 0].sum()) / len(some)
-    return bool(within < _MIXED * float(np.linalg.eigvalsh(np.cov(directions.T))[0]))
+    # All in one plane: one laser, or two that tell nothing.
+    together = float(np.linalg.eigvalsh(np.cov(directions.T))[0])
+    return len(counts) == 1 or together < _FLAT or within < _MIXED * together
 
 
 def common_height(z: FloatArray, rho: FloatArray) -> float:

@@ -110,11 +110,12 @@ def solve_with_terms(
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(_INNER_ITERATIONS)
     matches = match_all(terms, values, kernel_px, 1.0)
-    start, alone = values, marginal(graph, values, keys)[:7, :7]
+    rest, alone = values, marginal(graph, values, keys)[:7, :7]
+    warnings = wide_uncertainty(matches, values, alone)
     if np.isfinite(alone).all():
         # What the other factors know, wherever the given values are.
-        start = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-    warnings = wide_uncertainty(matches, values, alone)
+        rest = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+        alone = marginal(graph, rest, keys)[:7, :7]
     converged, rounds = False, 0
     while not converged and rounds < config.most_rounds:
         whole = with_factors(graph, matches)
@@ -145,7 +146,7 @@ def solve_with_terms(
     if not converged:
         warnings.append(TermWarning(WarningKind.NOT_CONVERGED, moved, _STEP_PX, "px"))
     warnings += last_warnings(matches, values, C, config)
-    warnings += far_from_start(keys, start, values, alone)
+    warnings += far_from_start(keys, rest, values, alone)
     warnings += covariance_warnings(
         marginal(whole, values, keys)[:7, :7], robust, keys.extrinsic(values), config
     )

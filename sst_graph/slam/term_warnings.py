@@ -27,7 +27,7 @@ class WarningKind(Enum):
     """What may be wrong with a solution."""
 
     WIDE_UNCERTAINTY = "the calibration is less certain than the matches reach"
-    FAR_FROM_START = "the estimate lies farther from the start than the rest of the graph allows"
+    FAR_FROM_START = "the estimate lies farther from where the rest of the graph has it than that allows"
     FAR_LINEARIZATION = "the solver has linearized away from the estimate"
     LEFT_INTERVAL = "stamp + offset has left the interval between its two poses"
     NO_MATCHES = "terms without a factor"

@@ -323,6 +323,7 @@ class Tracker:
         if jump is None:
             return None
         image, scan = jump.place
+        images = window.images
         if jump.sensor == "image":
             window.forget_images_before(image)
         since = window.next_scan - scan
@@ -331,6 +332,7 @@ class Tracker:
         changes = self.monitor.changes
         if changes.offset_held(scan, jump.time_offset_s, self.estimate.for_comparison()):
             _LOG.info("tracker: %s, and the time offset has not changed", jump.sentence)
+            window.images = images
             return None
         # Most likely the clock was set.
         known = changes.before(scan)

@@ -71,6 +71,16 @@ def test_numbers_that_do_not_belong_to_the_points_are_not_believed(turn_deg: flo
     found, recovered = arrange_beams(points, mixed), arrange_beams(points, None)
     np.testing.assert_array_equal(found.ring, recovered.ring)
     assert rings_belong(points[:10], mixed[:10])  # too few to tell
+    # Returns that were lost, at the origin; a scan of one laser.
+    lost = np.where(np.arange(len(points))[:, None] % 5 > 1, 0.0, turned)
+    assert rings_belong(lost, numbers) and not rings_belong(lost, mixed)
+    assert rings_belong(turned[rank == 3], numbers[rank == 3])
+    # Column after column: every eighth point is of the same laser.
+    many = np.arange(80_000)
+    azimuths, lasers = 2.0 * np.pi * (many // 8) / 10_000, many % 8
+    level = np.cos(ELEVATIONS[lasers])
+    seen = np.stack([level * np.cos(azimuths), level * np.sin(azimuths), np.sin(ELEVATIONS[lasers])], axis=1)
+    assert rings_belong(20.0 * seen, lasers)
 
 
 def test_rings_without_numbers() -> None:

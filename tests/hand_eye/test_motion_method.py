@@ -121,6 +121,18 @@ def test_motion_tells_a_camera_that_paused_from_a_clock_that_was_set(clock_set: 
     )
 
 
+@pytest.mark.parametrize("first", [25, 65])
+def test_a_scanner_that_paused_is_told_from_a_clock_that_was_set(first: int) -> None:
+    """Also away from the middle of the drive."""
+    held = []
+    for pause_ns, clock_ns in ((34_000_000, 0), (0, 34_000_000)):
+        drive = made_drive(weaving, 90, scans_late=(first, pause_ns, clock_ns))
+        (jump,) = jumps_in(drive)
+        assert jump.sensor == "scan" and jump.seconds == pytest.approx(0.034)
+        held.append(offsets_held_by_motion([drive], State(TRUE, (OFFSET_S,)), CalibrationConfig()))
+    assert len(held[0]) == 1 and not held[1]
+
+
 def test_noise_is_no_turning() -> None:
     """On a straight road the LiDAR's noise alone must tell no offset, wherever between stamps it falls."""
     found = [solve_motion([made_drive(straight, seed=seed)], Guess(TRUE, OFFSET_S))[0] for seed in range(2)]

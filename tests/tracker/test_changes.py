@@ -183,7 +183,8 @@ def test_a_camera_that_paused_is_told_from_a_clock_that_was_set(clock_set: bool)
     assert len(alarms) == clock_set
     if not clock_set:
         assert update.status == "ok" and tracker.estimate.starts == 1
-        assert sigmas_apart(tracker, fast.truth.cTl, 0.03) < 3.0
+        assert len(tracker.inputs.window.images) >= 28 and update.matches > 5000
+        assert sigmas_apart(tracker, fast.truth.cTl, 0.03) < 4.3  # 99 % of seven unknowns
 
 
 def test_a_jump_before_the_start_empties_the_window(street: SimulatedDrive, frames: list[Frame]) -> None:

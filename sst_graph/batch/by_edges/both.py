@@ -118,7 +118,7 @@ def fuse_parts(labels: _Part, edges: _Part) -> MethodEstimate:
     if labels.reasons:  # neither is usable
         reasons = [*(f"by labels: {each}" for each in labels.reasons)]
         reasons += [f"by edges: {each}" for each in edges.reasons]
-        return replace(labels, reasons=tuple(reasons), solved=None)
+        return replace(labels, reasons=tuple(reasons), solved=None, held_offsets=_held(labels, edges))
     return _of_both_parts(labels, edges)
 
 
@@ -131,9 +131,15 @@ def _of_one_part(used: MethodEstimate, left_out: tuple[str, _Part]) -> MethodEst
     return replace(
         used,
         remarks=(*used.remarks, remark),
+        held_offsets=_held(used, part),
         diagnostics={**used.diagnostics, "both": {"left_out": remark, **facts}},
         solved=None,
     )
+
+
+def _held(used: MethodEstimate, other: _Part) -> dict[str, str]:
+    """Jumps of the stamps after which either part shows the same time offset, the first one's words first."""
+    return {**({} if isinstance(other, str) else other.held_offsets), **used.held_offsets}
 
 
 def _of_both_parts(labels: MethodEstimate, edges: MethodEstimate) -> MethodEstimate:
@@ -167,6 +173,7 @@ def _of_both_parts(labels: MethodEstimate, edges: MethodEstimate) -> MethodEstim
         },
         solved=None,
         assumption_steps=fused.assumption_steps,
+        held_offsets=_held(labels, edges),
         # Of convergence and likelihood each part has its own, about another estimate than this.
         fit=_fit_at(fused.state, labels),
         edges_fit=_fit_at(fused.state, edges),

@@ -319,8 +319,8 @@ def _decide(windows: list[SweepWindow], timing: SweepTiming) -> SweepDecision:
     if decision.kind != "undecided" or decision.contradiction:
         # Sparse scans meet equally well under several shares, each with matches that confirm it.
         fits += [_Fit.of(before, (f, 0)) for f in _TRIED if (f, 0) != start]
-        best = min(fits, key=lambda fit: fit.estimate.misfit)
-        alike = [fit for fit in fits if fit.estimate.worse_by(best.estimate) < _SURELY_WORSE]
+        best, *rest = sorted(fits, key=lambda fit: fit.estimate.misfit)
+        alike = [best, *(fit for fit in rest if fit.estimate.worse_by(best.estimate) < _SURELY_WORSE)]
         decision = _in_common([_compare_hypotheses(*fit, timing) for fit in alike], timing)
         windows[:] = best.windows
     return replace(decision, speed_mps=speed)
@@ -343,10 +343,15 @@ def _in_common(decisions: Sequence[SweepDecision], timing: SweepTiming) -> Sweep
     """The first of some decisions about the same scans, in as far as all others are the same."""
     first = decisions[0]
     if len({(decision.kind, bool(decision.contradiction)) for decision in decisions}) == 1:
-        return first
+        away = [decision.timing.start_rad - first.timing.start_rad for decision in decisions]
+        apart = np.abs(np.mod(np.array(away) + np.pi, 2.0 * np.pi) - np.pi).max()
+        known = all(decision.start_known for decision in decisions) and apart < _SAME_START_RAD
+        return replace(first, start_known=bool(known))
     least = {name: min(one.worse_by[name] for one in decisions) for name in first.worse_by}
+    spread = float(np.ptp([decision.fraction for decision in decisions]))
     undecided = replace(first, kind="undecided", timing=timing, start_known=False, contradiction="")
-    return replace(undecided, worse_by=least, others=_both_senses(timing))
+    sigma = max(spread, *(decision.sigma for decision in decisions))
+    return replace(undecided, sigma=sigma, worse_by=least, others=_both_senses(timing))
 
 
 def _compare_hypotheses(
@@ -457,6 +462,8 @@ _COARSE = 8
 """Sectors between the starts that are tried first."""
 _TRIED = (0.0, -1.0, 1.0)
 """Shares of the sweep that registration begins with."""
+_SAME_START_RAD = 0.3
+"""A turn begins at one place where all fits find it within this."""
 _SURELY_WORSE = 3.0
 """A fit that is worse by more sigmas than this is no answer. Of 54 decisions about every second to fourth
 ring of KITTI drives four were wrong by the best start alone, and one is where others count; of 96 about

@@ -17,6 +17,9 @@ _CONVERGED = 0.005
 _POSES_ONLY = 2
 """Iterations in which only the poses move: what odometry left of their errors looks like a turn that begins
 ahead, and matches made under that one confirm it."""
+_LEAST_PAIRS, _LEAST_SPREAD = 8, 0.1
+"""Fewest pairs of scans by which two fits are compared, and least deviation of points missed from pair to
+pair."""
 _MAX_ITERATIONS = 12
 """Most times that points are matched again."""
 
@@ -84,9 +87,12 @@ class SweepEstimate:
 
     def worse_by(self, other: SweepEstimate) -> float:
         """By how many sigmas this fits worse than another estimate from the same windows: the mean over the
-        pairs of scans, with its standard error."""
-        more = self.missed - other.missed
-        return float(more.sum() / max(np.sqrt(((more - more.mean()) ** 2).sum()), 1e-9))
+        pairs of scans, with its standard error. Few pairs tell nothing of that: 0."""
+        more, n = self.missed - other.missed, len(self.missed)
+        if n < _LEAST_PAIRS:
+            return 0.0
+        variance = n / (n - 1.0) * float(((more - more.mean()) ** 2).sum())
+        return float(more.sum() / np.sqrt(max(variance, n * _LEAST_SPREAD**2)))
 
     def evidence(self, windows: Sequence[SweepWindow]) -> SweepEvidence:
         """Evidence for every start of a turn, at the last matches."""

@@ -313,7 +313,7 @@ class SweepWindow:
     def misfit(self) -> float:
         """Mean robust misfit of the chosen points, 0 (all on a surface) to 1 (none near one)."""
         count = sum(len(self._surfaces[rows.scans[1]].chosen) for rows in self._matches)
-        return float(self.missed().sum()) / max(count, 1)
+        return float(self.missed().sum()) / count if count else 1.0
 
     def missed(self) -> FloatArray:
         """(pairs of scans,) chosen points of each pair that lie on no surface, by the robust kernel."""

@@ -170,7 +170,7 @@ class Initializer:
         alarmed: there was an alarm, and no estimate since.
         search: the batch solution that is under way.
         graph: the graph that is being made at a solution.
-        why: the last attempt has failed; empty where none has.
+        why: the last attempt has failed, or the frames before were given up; empty where neither happened.
         work_per_frame: done with each frame; None: all with one, which takes seconds.
     """
 
