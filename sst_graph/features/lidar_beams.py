@@ -43,7 +43,7 @@ _MIXED = 0.7
 """Laser numbers that leave more of the variance of the directions than this are not those of the points. They
 leave less than 0.005 of it for spinning scanners, 0.2 to 0.55 seen from the vehicle's origin, and 0.9 or more
 where they are random."""
-_COMPARED, _LEAST_RANGE_M = 10_000, 0.5
+_COMPARED, _LEAST_RANGE_M = 3_000, 0.5
 """Points that are compared so, about, and how far away they are: returns that were lost are at the origin."""
 _FLAT = 1e-6
 """Variance of directions across a plane, of a milliradian, in which all lie."""
@@ -128,7 +128,7 @@ def rings_belong(points: FloatArray, rings: NDArray[np.integer]) -> bool:
     means = np.stack([np.bincount(ring, axis) for axis in directions.T], axis=1) / counts[:, None]
     off = directions - means[ring]
     squares = np.zeros((len(counts), 3, 3))
-    for i, j in np.ndindex(3, 3):
+    for i, j in zip(*np.tril_indices(3), strict=True):  # all that eigvalsh looks at
         squares[:, i, j] = np.bincount(ring, off[:, i] * off[:, j])
     within = float(np.linalg.eigvalsh(squares)[:, 0].sum()) / len(some)
     # All in one plane: one laser, or two that tell nothing.
