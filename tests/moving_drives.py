@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import gtsam
@@ -40,6 +40,28 @@ def resting(t: float) -> gtsam.Pose3:
     return gtsam.Pose3()
 
 
+@dataclass(frozen=True)
+class Clock:
+    """When the frames of a sensor are taken, and their stamps [ns]."""
+
+    taken: Sequence[int]
+    stamps: Sequence[int]
+
+
+def regular(frames: int) -> Clock:
+    """A frame a period, with right stamps."""
+    taken = [round(k * PERIOD_S * 1e9) for k in range(frames)]
+    return Clock(taken, taken)
+
+
+def jumping(frames: int, places: Sequence[int], clock_set: bool) -> Clock:
+    """From each of some frames on the stamps are 34 ms later, and so are the frames unless the clock was
+    set."""
+    taken = regular(frames).taken
+    stamps = [at + 34_000_000 * sum(k >= place for place in places) for k, at in enumerate(taken)]
+    return Clock(taken if clock_set else stamps, stamps)
+
+
 def made_drive(
     wTl: PoseAt,
     frames: int = 50,
@@ -47,46 +69,38 @@ def made_drive(
     noise: float = 1.0,
     yaw_noise: float = 1.0,
     lidar_noise: float = 1.0,
-    late_ns: Sequence[int] = (0,),
-    clock_set: bool = False,
-    scans_late: tuple[int, int, int] = (0, 0, 0),
+    image_clock: Clock | None = None,
+    scan_clock: Clock | None = None,
 ) -> Drive:
     """Odometry of both sensors under known noise; the LiDAR's poses err, not its steps.
 
     Args:
         lidar_noise: factor on the noise of the LiDAR alone, of which the odometry does not know.
         yaw_noise: factor on the LiDAR's noise about its z axis, of which the odometry does not know.
-        late_ns: by how much the stamps of the images are later than the scans', in equal stretches.
-        clock_set: the images themselves are not: the camera's clock was set.
-        scans_late: from which scan on the scanner is late, and its clock ahead, by how much [ns].
+        image_clock, scan_clock: of the frames, :func:`regular` where None.
     """
     rng = np.random.default_rng(seed)
     sigmas = noise * lidar_noise * np.repeat([SIGMA_RAD, SIGMA_M], 3)
     sigmas[2] *= yaw_noise
-    stamps = [round(k * PERIOD_S * 1e9) for k in range(frames)]
-    first, pause_ns, ahead_ns = scans_late
-    measured = [stamp + (pause_ns if k >= first else 0) for k, stamp in enumerate(stamps)]
-    stamped = [stamp + (ahead_ns if k >= first else 0) for k, stamp in enumerate(measured)]
-    poses = [wTl(s * 1e-9).retract(sigmas * rng.standard_normal(6)) for s in measured]
+    seen, swept = image_clock or regular(frames), scan_clock or regular(frames)
+    poses = [wTl(at * 1e-9).retract(sigmas * rng.standard_normal(6)) for at in swept.taken]
     lidar = tuple(
         RelativeMotion(a, b, p.between(q), np.diag(2.0 * np.repeat([SIGMA_RAD, SIGMA_M], 3) ** 2))
-        for a, b, p, q in zip(stamped, stamped[1:], poses, poses[1:], strict=False)
+        for (a, b), (p, q) in zip(pairwise(swept.stamps), pairwise(poses), strict=True)
     )
-    shown = [stamp + late_ns[len(late_ns) * k // frames] for k, stamp in enumerate(stamps)]
-    taken = stamps if clock_set else shown
-    camera = [_image_pair(a, b, wTl, rng, noise) for a, b in pairwise(taken)]
-    camera = [
-        replace(pair, tracks=replace(pair.tracks, from_ns=a, to_ns=b))
-        for pair, (a, b) in zip(camera, pairwise(shown), strict=True)
-    ]
+    camera = tuple(
+        ImagePair(ImageTracks(*stamps, np.zeros((0, 2)), np.zeros((0, 2))), _motion(*taken, wTl, rng, noise))
+        for stamps, taken in zip(pairwise(seen.stamps), pairwise(seen.taken), strict=True)
+    )
     blank, none = np.zeros((1, 1), np.uint8), np.zeros((0, 3))
-    images = tuple(ImageFeatures(k, stamp, blank, {}) for k, stamp in enumerate(shown))
+    images = tuple(ImageFeatures(k, stamp, blank, {}) for k, stamp in enumerate(seen.stamps))
     empty = none, np.zeros(0, np.uint8), none[:, 0], none.astype(np.float32), none[:, 0].astype(np.float32)
-    scans = tuple(ScanFeatures(k, stamp, {}, *empty) for k, stamp in enumerate(stamped))
-    return Drive("made", PinholeCamera(700, 700, 600, 180, 1242, 375), scans, images, lidar, tuple(camera))
+    scans = tuple(ScanFeatures(k, stamp, {}, *empty) for k, stamp in enumerate(swept.stamps))
+    return Drive("made", PinholeCamera(700, 700, 600, 180, 1242, 375), scans, images, lidar, camera)
 
 
-def _image_pair(a: int, b: int, wTl: PoseAt, rng: np.random.Generator, noise: float) -> ImagePair:
+def _motion(a: int, b: int, wTl: PoseAt, rng: np.random.Generator, noise: float) -> DirectionMotion:
+    """The camera's between two images."""
     ends = [wTl(stamp * 1e-9 + OFFSET_S) * TRUE.inverse() for stamp in (a, b)]
     aTb = ends[0].between(ends[1])
     turn = aTb.rotation() * gtsam.Rot3.Expmap(noise * SIGMA_RAD * rng.standard_normal(3))
@@ -96,5 +110,4 @@ def _image_pair(a: int, b: int, wTl: PoseAt, rng: np.random.Generator, noise: fl
         gtsam.Unit3(direction).retract(noise * SIGMA_DIRECTION * rng.standard_normal(2)).point3()
     )
     covariance = np.diag([SIGMA_RAD**2] * 3 + [SIGMA_DIRECTION**2] * 2)
-    motion = DirectionMotion(turn, turn, seen, covariance, 0.1, length > 0.1)
-    return ImagePair(ImageTracks(a, b, np.zeros((0, 2)), np.zeros((0, 2))), motion)
+    return DirectionMotion(turn, turn, seen, covariance, 0.1, length > 0.1)

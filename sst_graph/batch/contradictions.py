@@ -9,7 +9,7 @@ step: those beyond the kernel are gone.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -311,16 +311,14 @@ def offsets_held_by_labels(parts: PartSolver) -> dict[str, str]:
     def solved(number: int, jumps: Sequence[Jump]) -> list[PartEstimate | None]:
         ends = [jump.place[1] for jump in jumps]
         bounds = zip([0, *ends], [*ends, len(parts.drives[number].scans)], strict=True)
-        found = [_between_jumps(parts, Part(number, tuple(range(a, b))), jumps) for a, b in bounds]
+        found = [_solved_beside_jumps(parts, Part(number, tuple(range(a, b))), jumps) for a, b in bounds]
         return [None if part is None else part.step for part in found]
 
     return held_offsets(parts.drives, parts.problem.config, solved, "the labels")
 
 
-def _between_jumps(parts: PartSolver, part: Part, jumps: Sequence[Jump]) -> SolvedPart | None:
+def _solved_beside_jumps(parts: PartSolver, part: Part, jumps: Sequence[Jump]) -> SolvedPart | None:
     """A part by itself, from the estimate of all, or from one whose time offset differs by a jump."""
     reference = parts.reference_of(part)
-    shifts_s = [sign * jump.time_offset_s for jump in jumps for sign in (-1.0, 1.0)]
-    offset_s = reference.time_offsets_s[0]
-    starts = [replace(reference, time_offsets_s=(offset_s + shift_s,)) for shift_s in shifts_s]
+    starts = [reference.later(sign * jump.time_offset_s) for jump in jumps for sign in (-1.0, 1.0)]
     return parts.solve_from(part, parts.best_start(part, starts)) if part.scans else None

@@ -24,7 +24,7 @@ from sst_graph.covariance.observability import (
     reasons_of,
 )
 from sst_graph.covariance.shared_errors import SharedErrors
-from sst_graph.drive.preparation import Drive
+from sst_graph.drive.preparation import Drive, ImageFeatures, ScanFeatures
 from sst_graph.drive.stamp_intervals import Jump, jumps_of
 from sst_graph.fit import EDGES_QUALITY, QUALITY, Fit
 from sst_graph.graph.outer_loop import JointSolution
@@ -72,11 +72,15 @@ def jumps_in(drive: Drive) -> list[Jump]:
     return jumps_of(drive.image_stamps_ns, drive.scan_stamps_ns)
 
 
+def first_after(drive: Drive, jump: Jump) -> ImageFeatures | ScanFeatures:
+    """The first image, or scan, whose stamp has jumped."""
+    image, scan = jump.place
+    return drive.images[image] if jump.sensor == "image" else drive.scans[scan]
+
+
 def jump_sentence(drive: Drive, jump: Jump) -> str:
     """Where a jump is, and how large."""
-    image, scan = jump.place
-    frame = drive.images[image].index if jump.sensor == "image" else drive.scans[scan].index
-    return f"{drive.name}: at frame {frame} {jump.sentence}"
+    return f"{drive.name}: at frame {first_after(drive, jump).index} {jump.sentence}"
 
 
 def held_offsets(
@@ -173,10 +177,10 @@ def result_of(
     or nothing decides a sweep that matters."""
     advice = MOTION if config.method == "motion" else SILHOUETTES
     weak = _weak_directions(estimate, config.observability, advice)
-    jumps = [jump_sentence(drive, jump) for drive in drives for jump in jumps_in(drive)]
     held = estimate.held_offsets
     wrong, remarks = [*estimate.reasons], [*estimate.remarks]
     if config.check_stamps:
+        jumps = [jump_sentence(drive, jump) for drive in drives for jump in jumps_in(drive)]
         wrong += [f"{jump}: {_CALIBRATE_APART}" for jump in jumps if jump not in held]
         remarks += [held[jump] for jump in jumps if jump in held]
     status: Status = "not_converged" if wrong else "unobservable" if estimate.open_sweeps or weak else "ok"

@@ -10,7 +10,7 @@ import numpy as np
 
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.contradictions import FALSE_ALARM
-from sst_graph.batch.method_estimate import held_offsets
+from sst_graph.batch.method_estimate import first_after, held_offsets
 from sst_graph.batch.part_solver import PartSolver, SolvedPart
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.covariance.contradiction import Difference, PartEstimate, name_step
@@ -198,9 +198,8 @@ def offsets_held_by_motion(
     """
 
     def solved(number: int, jumps: Sequence[Jump]) -> list[PartEstimate | None]:
-        drive, own = drives[number], State(state.cTl, (state.time_offset_s(number),))
-        parts = _between_jumps(drive, jumps, config.search.time_offset_s)
-        return [_by_motion(part, own, config) for part in parts]
+        parts = _between_jumps(drives[number], jumps, config.search.time_offset_s)
+        return [_by_motion(part, state.of_drive(number), config) for part in parts]
 
     return held_offsets(drives, config, solved, "the motion")
 
@@ -211,13 +210,7 @@ def _between_jumps(drive: Drive, jumps: Sequence[Jump], margin_s: float) -> list
     Args:
         margin_s: by how much stamps of the other sensor may be off.
     """
-    ends = [
-        (
-            jump.sensor,
-            (drive.images[jump.place[0]] if jump.sensor == "image" else drive.scans[jump.place[1]]).stamp_ns,
-        )
-        for jump in jumps
-    ]
+    ends = [(jump.sensor, first_after(drive, jump).stamp_ns) for jump in jumps]
     margin_ns = round(1e9 * margin_s)
 
     def kept(sensor: str, from_ns: int, to_ns: int, part: int) -> bool:

@@ -89,12 +89,7 @@ class PartSolver:
         """The reference, one image or one scan earlier or later."""
         reference, drive = self.reference_of(part), self.drives[part.drive]
         periods_s = {round(period_s, 3) for period_s in (drive.image_period_s, drive.scan_period_s)}
-        offset_s = reference.time_offsets_s[0]
-        return [
-            replace(reference, time_offsets_s=(offset_s + sign * period_s,))
-            for period_s in sorted(periods_s)
-            for sign in (-1.0, 1.0)
-        ]
+        return [reference.later(sign * period_s) for period_s in sorted(periods_s) for sign in (-1.0, 1.0)]
 
     def total_support(self, part: Part, state: State) -> float:
         """:meth:`support` of all scans of a part together."""
@@ -131,7 +126,7 @@ class PartSolver:
 
     def reference_of(self, part: Part) -> State:
         """The reference on the part's clock alone."""
-        return State(self.reference.cTl, (self.reference.time_offset_s(part.drive),))
+        return self.reference.of_drive(part.drive)
 
     def _step(self, part: Part, solution: JointSolution) -> PartEstimate:
         objects = [tracks_of_scans(self.problem.objects[part.drive], part.scans)]

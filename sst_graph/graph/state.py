@@ -89,6 +89,14 @@ class State:
         """Mask biases of a drive by class [px]."""
         return {c: bias for (d, c), bias in self.biases_px.items() if d == drive}
 
+    def of_drive(self, drive: int) -> State:
+        """Extrinsic and the time offset of a drive, without anything else."""
+        return State(self.cTl, (self.time_offset_s(drive),))
+
+    def later(self, seconds: float) -> State:
+        """The state with all time offsets moved by so much [s]."""
+        return replace(self, time_offsets_s=tuple(offset_s + seconds for offset_s in self.time_offsets_s))
+
     def moved(self, step: FloatArray) -> State:
         """Extrinsic and first time offset a step (7,) away, without anything else."""
         return State(self.cTl.retract(step[:6]), (self.time_offsets_s[0] + float(step[6]),))

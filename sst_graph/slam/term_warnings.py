@@ -17,8 +17,8 @@ from sst_graph.slam.config import RematchConfig
 from sst_graph.types import FloatArray
 
 MOST_SIGMAS = 4.3
-"""An estimate farther from the start contradicts what was known there: chi-squared of 7 exceeds its square
-once in a hundred [sigma]."""
+"""An estimate farther from where the other factors have it contradicts them: chi-squared of 7 exceeds its
+square once in a hundred [sigma]."""
 MOST_LINEAR_PX = 1.0
 """An estimate farther than this from where the solver linearized is not what the matches say [px]."""
 
@@ -100,10 +100,11 @@ def uncertainty_px(matches: Sequence[TermMatches], values: gtsam.Values, covaria
 def far_from_start(
     keys: AlignmentKeys, start: gtsam.Values, values: gtsam.Values, covariance: FloatArray
 ) -> list[TermWarning]:
-    """A warning where matches have led to another calibration than was known at the start.
+    """A warning where matches have led to another calibration than the other factors have.
 
     Args:
-        covariance: (7, 7) of extrinsic and offset at the start, by all but the matches.
+        start: the estimate without the matches.
+        covariance: (7, 7) of extrinsic and offset there, by all but the matches.
     """
     if not np.isfinite(covariance).all():
         return []

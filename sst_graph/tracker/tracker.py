@@ -329,14 +329,13 @@ class Tracker:
         since = window.next_scan - scan
         if not self.estimate.exists:
             return Restart(guess, since, jump.sentence)
-        changes = self.monitor.changes
-        if changes.offset_held(scan, jump.time_offset_s, self.estimate.for_comparison()):
+        changes, compared = self.monitor.changes, self.estimate.for_comparison()
+        if changes.offset_held(scan, jump.time_offset_s, compared):
             _LOG.info("tracker: %s, and the time offset has not changed", jump.sentence)
             window.images = images
             return None
         # Most likely the clock was set.
-        known = changes.before(scan)
-        before = point if known is None else known.point
+        before = changes.before(scan, compared).point
         near = StartGuess(before.cTl, before.time_offset_s + jump.time_offset_s, search=changes.far)
         return Restart(near, since, jump.sentence, alarm=True, chi2=jump.chi2)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
-from moving_drives import OFFSET_S, TRUE, made_drive, resting, straight, weaving
+from moving_drives import OFFSET_S, TRUE, jumping, made_drive, resting, straight, weaving
 from stored import written
 from streets import standing_street
 
@@ -109,7 +109,7 @@ def test_noise_of_the_lidar_does_not_draw_the_offset_to_its_stamps(lidar_noise: 
 @pytest.mark.parametrize("clock_set", [False, True])
 def test_motion_tells_a_camera_that_paused_from_a_clock_that_was_set(clock_set: bool) -> None:
     """Twice; the motions between two parts belong to neither."""
-    drive = made_drive(weaving, 90, late_ns=(0, 34_000_000, 68_000_000), clock_set=clock_set)
+    drive = made_drive(weaving, 90, image_clock=jumping(90, (30, 60), clock_set))
     jumps = jumps_in(drive)
     assert [round(1e3 * jump.seconds) for jump in jumps] == [34, 34]
     held = offsets_held_by_motion([drive], State(TRUE, (OFFSET_S,)), CalibrationConfig())
@@ -125,8 +125,8 @@ def test_motion_tells_a_camera_that_paused_from_a_clock_that_was_set(clock_set: 
 def test_a_scanner_that_paused_is_told_from_a_clock_that_was_set(first: int) -> None:
     """Also away from the middle of the drive."""
     held = []
-    for pause_ns, clock_ns in ((34_000_000, 0), (0, 34_000_000)):
-        drive = made_drive(weaving, 90, scans_late=(first, pause_ns, clock_ns))
+    for clock_set in (False, True):
+        drive = made_drive(weaving, 90, scan_clock=jumping(90, (first,), clock_set))
         (jump,) = jumps_in(drive)
         assert jump.sensor == "scan" and jump.seconds == pytest.approx(0.034)
         held.append(offsets_held_by_motion([drive], State(TRUE, (OFFSET_S,)), CalibrationConfig()))

@@ -92,7 +92,7 @@ def _half(
     searched = run_to_end(edge_starts_steps(edges[0], region))
     trials = [(0.0, state), *((0.0, replace(state, cTl=start.cTl)) for start in searched)]
     late_s = [images * drive.image_period_s for images in _LATE_IMAGES]
-    trials += [(shift_s, _later(state, shift_s)) for shift_s in late_s]
+    trials += [(shift_s, state.later(shift_s)) for shift_s in late_s]
     found: list[tuple[float, float, State]] = []
     for shift_s, start in trials:
         try:
@@ -114,16 +114,11 @@ def _half(
     return PartEstimate(difference(state, best), 2.0 * covariance, float(SAMPLES))
 
 
-def _later(state: State, shift_s: float) -> State:
-    """The state with its time offset moved."""
-    return replace(state, time_offsets_s=tuple(offset_s + shift_s for offset_s in state.time_offsets_s))
-
-
 def _with_later_offset(problem: JointProblem, shift_s: float) -> JointProblem:
     """The problem with all that is known of the time offset beside the edges moved."""
     centre, prior = problem.centre, problem.prior
     return replace(
         problem,
-        centre=None if centre is None else _later(centre, shift_s),
-        prior=None if prior is None else replace(prior, state=_later(prior.state, shift_s)),
+        centre=None if centre is None else centre.later(shift_s),
+        prior=None if prior is None else replace(prior, state=prior.state.later(shift_s)),
     )

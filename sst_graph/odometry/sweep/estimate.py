@@ -73,8 +73,7 @@ class SweepEstimate:
         quadratic: the cost around it.
         normals: of the windows, at the last matches.
         linearized_at: share and start under which those were made.
-        misfit: mean robust misfit of the matches at the end, 0 to 1.
-        missed: (pairs of scans,) :meth:`SweepWindow.missed` of all windows.
+        missed: (pairs of scans,) :meth:`SweepWindow.missed` of all windows at the end.
     """
 
     fraction: float
@@ -82,8 +81,12 @@ class SweepEstimate:
     quadratic: Quadratic
     normals: tuple[Normal, ...]
     linearized_at: tuple[float, int]
-    misfit: float
     missed: FloatArray
+
+    @property
+    def misfit(self) -> float:
+        """All points missed: the least is the best fit of the same windows."""
+        return float(self.missed.sum())
 
     def worse_by(self, other: SweepEstimate) -> float:
         """By how many sigmas this fits worse than another estimate from the same windows: the mean over the
@@ -177,7 +180,7 @@ def estimate(windows: Sequence[SweepWindow], fraction: float = 0.0, sector: int 
         sector = best
         if done:
             break
-    return SweepEstimate(fraction, sector, quadratic, normals, present, *_misfit(windows))
+    return SweepEstimate(fraction, sector, quadratic, normals, present, _missed(windows))
 
 
 def at_hypothesis(
@@ -189,8 +192,7 @@ def at_hypothesis(
         _move(windows, normals, np.zeros(1 + SECTORS))
     shares = quadratic.free()
     best = int(np.argmin(quadratic.cost(shares)))
-    present = fraction, sector
-    return SweepEstimate(float(shares[best]), best, quadratic, normals, present, *_misfit(windows))
+    return SweepEstimate(float(shares[best]), best, quadratic, normals, (fraction, sector), _missed(windows))
 
 
 def _matched(
@@ -208,7 +210,5 @@ def _move(windows: Sequence[SweepWindow], normals: Sequence[Normal], step: Float
         window.move(normal, step)
 
 
-def _misfit(windows: Sequence[SweepWindow]) -> tuple[float, FloatArray]:
-    """Mean misfit, and points missed by each pair of scans."""
-    missed = np.concatenate([window.missed() for window in windows])
-    return float(np.mean([window.misfit() for window in windows])), missed
+def _missed(windows: Sequence[SweepWindow]) -> FloatArray:
+    return np.concatenate([window.missed() for window in windows])

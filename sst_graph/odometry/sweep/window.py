@@ -310,11 +310,6 @@ class SweepWindow:
             np.concatenate([rows.residuals for rows in self._matches]),
         )
 
-    def misfit(self) -> float:
-        """Mean robust misfit of the chosen points, 0 (all on a surface) to 1 (none near one)."""
-        count = sum(len(self._surfaces[rows.scans[1]].chosen) for rows in self._matches)
-        return float(self.missed().sum()) / count if count else 1.0
-
     def missed(self) -> FloatArray:
         """(pairs of scans,) chosen points of each pair that lie on no surface, by the robust kernel."""
         scale = _SCALES_M[-1]

@@ -361,16 +361,17 @@ class ChangeDetector:
         the new calibration may be anywhere."""
         return self._is_unmatched(CONFIRMATIONS)
 
-    def before(self, scan: int) -> Reference | None:
-        """The latest estimate that was made without a scan, among those from before the latest frames."""
-        known = [before for before in (self.reference, *self._before) if before is not None]
-        earlier = [before for before in known if before.scan <= scan]
-        return (earlier[-1] if earlier else known[0]) if known else None
+    def before(self, scan: int, estimate: ComparedEstimate) -> Reference:
+        """The latest estimate that was made without a scan, among those from before the latest frames; the
+        running one where none is kept."""
+        kept = [before for before in (self.reference, *self._before) if before is not None]
+        earlier = [before for before in kept if before.scan <= scan]
+        return (*kept[:1], *earlier)[-1] if kept else Reference(estimate.point, estimate.covariance, scan)
 
     def offset_held(self, first: int, step_s: float, estimate: ComparedEstimate) -> bool:
         """Whether scans from the first one on agree with the estimate before them, though they would have
         shown a step of the time offset [s]."""
-        before = self.before(first) or Reference(estimate.point, estimate.covariance, first)
+        before = self.before(first, estimate)
         scans = range(first, self.matcher.window.next_scan)
         scores = self.matcher.linearized_at(before.point, scans, _KERNEL, self._moving)
         if not scores or self.contradicted or self.far:
