@@ -466,7 +466,7 @@ _SAME_START_RAD = 0.3
 """A turn begins at one place where all fits find it within this."""
 _SURELY_WORSE = 3.0
 """A fit that is worse by more sigmas than this is no answer. Of 54 decisions about every second to fourth
-ring of KITTI drives four were wrong by the best start alone, and one is where others count; of 96 about
-simulated streets, with all, half or a quarter of the rings, none changed."""
+ring of KITTI drives four were wrong by the best start alone, and one is where others count (the other three:
+``test_the_sweep_that_few_rings_show``)."""
 _FEW_SCANS, _FEW_POINTS, _TRIED_ITERATIONS = 6, 60, 4
 """Scans, points of each direction of normals, and iterations for each start that is tried."""
