@@ -9,12 +9,13 @@ A table stands between two comments, of which the first holds the command that m
 
 What the command prints goes between them, with the command above it and the version of the code below it.
 Words choose tables whose page or command has all of them. Tables that this code, or code that does not differ
-from it, has made are left as they are; so what was interrupted goes on.
+from it but for comments and docstrings, has made are left as they are; so what was interrupted goes on.
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
 import os
 import re
 import shlex
@@ -27,8 +28,8 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
-CODE = ("sst_graph", "factors", "studies", "benchmarks")
-"""Folders that figures depend on."""
+CODE = {"sst-graph": ("sst_graph", "factors"), "python": ("sst_graph", "factors", "studies")}
+"""Folders that the figures of a command depend on, by its first word."""
 DRIVES = ("STOP", "PARKED")
 """Names in commands that stand for the folders of drives."""
 BLOCK = re.compile(r"<!-- table: (?P<command>.+?) -->\n(?P<body>.*?)<!-- end of table -->", re.DOTALL)
@@ -129,12 +130,45 @@ def printed_by(command: str, data: Mapping[str, str]) -> str:
     return text
 
 
-def same_code(commit: str) -> bool:
-    """Whether the code of a commit makes the figures that this code makes."""
+def same_code(commit: str, command: str) -> bool:
+    """Whether the code of a commit makes the figures of a command that this code makes.
+
+    Files that were added since, comments and docstrings make no difference.
+    """
     if not commit:
         return False
-    done = subprocess.run(["git", "diff", "--quiet", commit, "--", *CODE], cwd=ROOT, check=False)
-    return done.returncode == 0
+    folders = CODE["python" if "python" in command.split() else "sst-graph"]
+    changed = _git("diff", "--name-only", "--no-renames", "--diff-filter=a", commit, "--", *folders)
+    return changed is not None and all(_same_file(commit, name) for name in changed.splitlines())
+
+
+def _same_file(commit: str, name: str) -> bool:
+    before, now = _git("show", f"{commit}:{name}"), ROOT / name
+    if before is None or not now.is_file() or now.suffix != ".py":
+        return False
+    return _executed(before) == _executed(now.read_text(encoding="utf-8"))
+
+
+def _executed(source: str) -> str:
+    """The syntax tree of a program without its docstrings."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        for block in ("body", "orelse", "finalbody"):
+            statements = getattr(node, block, None)
+            if isinstance(statements, list):
+                setattr(node, block, [one for one in statements if not _is_text(one)])
+    return ast.dump(tree)
+
+
+def _is_text(statement: ast.stmt) -> bool:
+    value = getattr(statement, "value", None) if isinstance(statement, ast.Expr) else None
+    return isinstance(value, ast.Constant) and isinstance(value.value, str)
+
+
+def _git(*command: str) -> str | None:
+    """What git prints; None where it fails, as for a commit that it does not know."""
+    done = subprocess.run(["git", *command], cwd=ROOT, capture_output=True, text=True, check=False)
+    return done.stdout if done.returncode == 0 else None
 
 
 def _commit() -> str:
@@ -170,14 +204,14 @@ def main() -> int:
     chosen = [table for table in found if table.has(args.words)]
     if args.list:
         for table in chosen:
-            state = "as now" if same_code(table.commit) else "other code"
+            state = "as now" if same_code(table.commit, table.command) else "other code"
             print(f"{table.page.relative_to(HERE)}: {table.commit or 'never'} ({state}): {table.command}")
         return 0
-    if not same_code("HEAD"):
-        parser.error(f"changes in {', '.join(CODE)} that are not committed: no version would name them")
+    if not all(same_code("HEAD", table.command) for table in chosen):
+        parser.error("changes of the code that are not committed: no version would name them")
     failed, commit = 0, _commit()
     for table in chosen:
-        if same_code(table.commit):
+        if same_code(table.commit, table.command):
             continue
         began = time.monotonic()
         try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import subprocess
 import sys
 from pathlib import Path
 
@@ -64,3 +65,39 @@ def test_what_a_command_prints_replaces_the_table(tmp_path: Path) -> None:
 def test_a_command_without_a_table_is_said(command: str, why: str) -> None:
     with pytest.raises(make_tables.TableError, match=why):
         make_tables.body(command, make_tables.printed_by(command, {"STOP": "."}), "abcdef12")
+
+
+@pytest.mark.parametrize(
+    ("now", "same"),
+    [
+        ('"""Other words."""\n\n\ndef half(x):\n    """Half of it."""  # shorter\n    return x / 2\n', True),
+        ('"""A module."""\n\n\ndef half(x):\n    return x / 3\n', False),
+        (None, False),
+    ],
+)
+def test_words_do_not_make_other_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, now: str | None, same: bool
+) -> None:
+    """Docstrings, comments and added files leave figures valid; another number or a lost file does not."""
+
+    def git(*command: str) -> str:
+        who = ["-c", "user.name=a", "-c", "user.email=a@b"]
+        whole = ["git", *who, *command]
+        return subprocess.run(whole, cwd=tmp_path, capture_output=True, text=True, check=True).stdout.strip()
+
+    source = tmp_path / "sst_graph" / "half.py"
+    source.parent.mkdir()
+    source.write_text('"""A module."""\n\n\ndef half(x):\n    return x / 2\n')
+    git("init", "-q")
+    git("add", ".")
+    git("commit", "-q", "-m", "Half")
+    commit = git("rev-parse", "--short", "HEAD")
+    (tmp_path / "sst_graph" / "added.py").write_text("x = 1\n")
+    if now is None:
+        source.unlink()
+    else:
+        source.write_text(now)
+    git("add", ".")
+    monkeypatch.setattr(make_tables, "ROOT", tmp_path)
+    assert make_tables.same_code(commit, "sst-graph experiment fit") is same
+    assert not make_tables.same_code("0000000", "sst-graph experiment fit")
