@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from sst_graph.export import EXTRINSIC, TIME_OFFSET, CalibrationMarginal
+from sst_graph.types import FloatArray
 
-SOURCE = Path(__file__).resolve().parents[2] / "examples" / "marginal_reader.cpp"
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 INCLUDES = [Path("/usr/include"), Path("/usr/local/include")]
 EIGEN = [folder / "eigen3" for folder in INCLUDES if (folder / "eigen3").is_dir()]
 JSON = [folder for folder in INCLUDES if (folder / "nlohmann" / "json.hpp").is_file()]
@@ -20,12 +21,29 @@ JSON = [folder for folder in INCLUDES if (folder / "nlohmann" / "json.hpp").is_f
 
 @pytest.fixture(scope="module")
 def reader(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return _compiled("marginal_reader", tmp_path_factory)
+
+
+@pytest.fixture(scope="module")
+def with_gtsam(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where GTSAM is installed elsewhere, CPLUS_INCLUDE_PATH, LIBRARY_PATH, LD_LIBRARY_PATH say it."""
+    include = "#include <gtsam/nonlinear/LinearContainerFactor.h>"
+    probe = ["g++", "-std=c++17", *(f"-isystem{folder}" for folder in EIGEN), "-fsyntax-only", "-xc++", "-"]
+    if shutil.which("g++") is None:
+        pytest.skip("needs g++")
+    if subprocess.run(probe, input=include, text=True, capture_output=True).returncode:
+        pytest.skip("needs GTSAM's headers")
+    return _compiled("marginal_factor", tmp_path_factory, "-lgtsam")
+
+
+def _compiled(name: str, folders: pytest.TempPathFactory, *libraries: str) -> Path:
     compiler = shutil.which("g++")
     if compiler is None or not EIGEN or not JSON:
         pytest.skip("needs g++, Eigen and nlohmann/json")
-    program = tmp_path_factory.mktemp("cpp") / "marginal_reader"
-    flags = ["-std=c++17", "-Wall", "-Wextra", "-Werror", f"-I{EIGEN[0]}"]
-    subprocess.run([compiler, *flags, str(SOURCE), "-o", str(program)], check=True, timeout=300)
+    program = folders.mktemp("cpp") / name
+    flags = ["-std=c++17", "-Wall", "-Wextra", "-Werror", f"-isystem{EIGEN[0]}"]
+    source = str(EXAMPLES / f"{name}.cpp")
+    subprocess.run([compiler, *flags, source, *libraries, "-o", str(program)], check=True, timeout=300)
     return program
 
 
@@ -39,13 +57,29 @@ def _marginal() -> CalibrationMarginal:
 
 def test_cpp_reads_the_same_cost(reader: Path, tmp_path: Path) -> None:
     """Near the point, a radian away, and at the point itself: gtsam's LinearContainerFactor agrees."""
-    marginal, rng = _marginal(), np.random.default_rng(5)
-    path = tmp_path / "marginal.json"
+    marginal = _marginal()
+    costs, steps, answer = _answers(reader, marginal, tmp_path / "marginal.json")
+    np.testing.assert_allclose(answer[:, 1:], steps, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(answer[:, 0], costs, rtol=1e-9)
+
+
+def test_cpp_has_the_same_factor(with_gtsam: Path, tmp_path: Path) -> None:
+    """The factor that GTSAM builds from the file in C++: the same error, and the marginal's optimum."""
+    marginal = _marginal()
+    costs, _, answer = _answers(with_gtsam, marginal, tmp_path / "marginal.json")
+    np.testing.assert_allclose(answer[:, 0], costs, rtol=1e-9)
+    optimum = np.linalg.solve(marginal.information, marginal.vector)
+    np.testing.assert_allclose(answer[:, 1:], np.tile(optimum, (len(answer), 1)), atol=1e-7)
+
+
+def _answers(
+    program: Path, marginal: CalibrationMarginal, path: Path
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """gtsam's errors in Python (n,), steps from the linearization point (n, 7), the program's lines."""
     path.write_text(marginal.to_json())
-    factor, lines, costs, steps = marginal.factor(), [], [], []
+    rng, factor, lines, costs, steps = np.random.default_rng(5), marginal.factor(), [], [], []
     for size in (0.0, 1e-6, 1e-2, 1.0):
-        d = size * rng.uniform(-0.5, 0.5, 7)
-        cTl, time_offset_s = there = marginal.at.retract(d)
+        cTl, time_offset_s = there = marginal.at.retract(size * rng.uniform(-0.5, 0.5, 7))
         values = gtsam.Values()
         values.insert(EXTRINSIC, cTl)
         values.insert(TIME_OFFSET, np.array([time_offset_s]))
@@ -53,11 +87,10 @@ def test_cpp_reads_the_same_cost(reader: Path, tmp_path: Path) -> None:
         steps.append(marginal.at.local_coordinates(there))
         lines.append(" ".join(repr(float(x)) for x in [*cTl.matrix()[:3].ravel(), time_offset_s]))
     done = subprocess.run(
-        [reader, path], input="\n".join(lines), capture_output=True, text=True, check=True, timeout=60
+        [program, path], input="\n".join(lines), capture_output=True, text=True, check=True, timeout=60
     )
     answer = np.array([[float(word) for word in line.split()] for line in done.stdout.splitlines()])
-    np.testing.assert_allclose(answer[:, 1:], steps, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(answer[:, 0], costs, rtol=1e-9)
+    return np.array(costs), np.array(steps), answer
 
 
 def test_cpp_refuses_another_file(reader: Path, tmp_path: Path) -> None:
