@@ -11,7 +11,7 @@ from typing import Any
 from sst_graph.cli import EXIT_NOT_TRUSTED
 from sst_graph.cli.messages import complain, loudness
 from sst_graph.cli.pictures import ShownFrame, overlay, png, telling_positions
-from sst_graph.cli.progress import ProgressBar, ProgressStage
+from sst_graph.cli.progress import ProgressBar
 from sst_graph.data.frame_parts import RecentReader
 from sst_graph.files import OutputKind
 from sst_graph.inspect.inspection import inspect_result, to_dict
@@ -61,8 +61,7 @@ def write_calibration(
         with_report: write the page with pictures and charts, too.
     """
     with ProgressBar() as progress:
-        stage = progress.stage("pictures and report")
-        return _written(folder, result, sources, against, with_report, stage)
+        return _written(folder, result, sources, against, with_report, progress)
 
 
 def _written(
@@ -71,10 +70,10 @@ def _written(
     sources: Sequence[Source],
     against: ReferenceErrors | None,
     with_report: bool,
-    progress: ProgressStage,
+    progress: ProgressBar,
 ) -> list[str]:
     pictures, frames, shown_frames = [], [], []
-    progress(0, PICTURES + 1)
+    progress("pictures", 0, PICTURES)
     read = [with_sweep_of(source, result.diagnostics) for source in sources]
     for source, swept, plain in zip(sources, read, _file_names(sources), strict=True):
         drive = RecentReader(swept)
@@ -86,16 +85,15 @@ def _written(
             if with_report and result.fit is None:  # else the report chooses by the fit
                 frames.append(shown.drawn())
             pictures.append(name)
-            progress(len(pictures), PICTURES + 1)
+            progress("pictures", len(pictures), max(PICTURES, len(pictures)))
     (folder / RESULT_NAME).write_text(result.to_json(), encoding="utf-8")
     markdown = markdown_report(result, against, pictures, legend_of(shown_frames))
     (folder / "report.md").write_text(markdown, encoding="utf-8")
     if not with_report:
         return [RESULT_NAME, "report.md", *pictures]
     drawn = [one for one in frames if one is not None]
-    page = report_html(ReportInputs(result, read, against, drawn))
+    page = report_html(ReportInputs(result, read, against, drawn), progress.stage("report"))
     (folder / REPORT_NAME).write_text(page, encoding="utf-8")
-    progress(PICTURES + 1, PICTURES + 1)
     return [RESULT_NAME, REPORT_NAME, "report.md", *pictures]
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -116,23 +117,31 @@ class ReportInputs:
     frames: Sequence[DrawnFrame] = ()
 
 
-def report_html(inputs: ReportInputs) -> str:
+def report_html(inputs: ReportInputs, progress: Callable[[int, int], None] | None = None) -> str:
     """The page: nothing in it is loaded from elsewhere.
+
+    Args:
+        progress: called with (parts done, parts in all).
 
     Raises:
         DataError: the drives cannot be read again.
     """
     result, reader = inputs.result, DriveReader(inputs.sources)
     inspection = inspect_result(result)
-    body = [
-        _verdict(inputs),
-        _next(inspection),
-        _pictures(inputs, reader),
-        *(_close_ups(inputs, fit, reader) for fit in result.fits),
-        *(_residuals(result, fit) for fit in result.fits),
-        _likelihood(inspection),
-        _background(inputs, inspection),
+    parts: list[Callable[[], str]] = [
+        lambda: _verdict(inputs),
+        lambda: _next(inspection),
+        lambda: _pictures(inputs, reader),
+        *(partial(_close_ups, inputs, fit, reader) for fit in result.fits),
+        *(partial(_residuals, result, fit) for fit in result.fits),
+        lambda: _likelihood(inspection),
+        lambda: _background(inputs, inspection),
     ]
+    body = []
+    for done, part in enumerate(parts):
+        if progress is not None:
+            progress(done, len(parts))
+        body.append(part())
     drives = ", ".join(sorted({frame.drive for frame in result.frames_used}))
     title = f"Calibration of {result.image_topic or result.camera_name}" + (
         f" from {drives}" if drives else ""
