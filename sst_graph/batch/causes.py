@@ -37,7 +37,7 @@ from sst_graph.graph.outer_loop import (
 from sst_graph.graph.state import State
 from sst_graph.initialization.candidates import StartProblem, prior_centre
 from sst_graph.initialization.selection import select_start_steps
-from sst_graph.result import CalibrationResult
+from sst_graph.result import LIKELY_CAUSES, CalibrationResult
 from sst_graph.sampling import step_for
 from sst_graph.types import Guess
 
@@ -84,7 +84,9 @@ def with_causes(
         result = replace(result, reasons=(*result.reasons, *remarks))
     if causes:
         status = "not_converged" if estimated else result.status
-        result = replace(result, status=status, reasons=(*causes, *result.reasons))
+        diagnostics = {**result.diagnostics, LIKELY_CAUSES: causes}
+        reasons = (*causes, *result.reasons)
+        result = replace(result, status=status, reasons=reasons, diagnostics=diagnostics)
     return _with_unlabelled_frames(result, drives, config)
 
 

@@ -15,8 +15,9 @@ from sst_graph.cli.progress import ProgressBar
 from sst_graph.data.frame_parts import RecentReader
 from sst_graph.files import OutputKind
 from sst_graph.inspect.inspection import inspect_result, to_dict
-from sst_graph.inspect.reasons import MOST_REASONS, short_reasons
+from sst_graph.inspect.reasons import MOST_REASONS, leading_reasons, short_reasons
 from sst_graph.inspect.report import OWN_CALIBRATION, ReferenceErrors, markdown_report
+from sst_graph.inspect.verdict import is_start
 from sst_graph.metrics import calibration_errors
 from sst_graph.odometry.sweep import with_sweep_of
 from sst_graph.report import ReportInputs, report_html
@@ -39,6 +40,8 @@ def comparison(result: CalibrationResult, sources: Sequence[Source]) -> Referenc
     if truth is None:
         return None
     reference = bool(getattr(sources[0], "truth_is_reference", False))
+    if is_start(result) and result.T_camera_lidar.equals(truth.cTl, 1e-9):
+        return None  # the start is this very transform: no errors are found in it
     errors = calibration_errors(
         result.T_camera_lidar,
         result.time_offset_s,
@@ -122,6 +125,8 @@ def exit_code(result: CalibrationResult) -> int:
 def why_not_ok(result: CalibrationResult) -> str:
     """Status and first reason of a result that is not ok, in one line."""
     first, *others = short_reasons(result) or ("the result carries no reason",)
+    if consequences := leading_reasons(result)[1]:
+        return f"{result.status}: {first} ({consequences}; in the report)"
     in_summary = not loudness.quiet and len(others) < MOST_REASONS
     where = "in the summary; in full in the report" if in_summary else "in the report"
     more = f" ({len(others)} more {where})" if others else ""

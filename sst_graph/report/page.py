@@ -25,7 +25,7 @@ from sst_graph.inspect.inspection_text import (
     weakest_ratio,
 )
 from sst_graph.inspect.misfit import DRIVING_MPS, misfits
-from sst_graph.inspect.reasons import as_sentence, capitalized, short_reasons
+from sst_graph.inspect.reasons import as_sentence, capitalized, leading_reasons
 from sst_graph.inspect.report import ReferenceErrors, error_lines, summary_rows
 from sst_graph.inspect.verdict import RIGHT_OVER_CHANCE, figure, fit_line, is_start, verdict
 from sst_graph.report.close_ups import ZOOM, close_ups
@@ -202,7 +202,10 @@ def _next(inspection: Inspection) -> str:
         for one in result.weak_directions
         if not any(one.sentence in reason for reason in result.reasons)
     ]
-    short = [as_sentence(capitalized(reason)) for reason in short_reasons(result)]
+    reasons, others = leading_reasons(result)
+    short = [as_sentence(capitalized(reason)) for reason in reasons]
+    if others:
+        short.append(f"{others}.")
     trusted = result.status != "not_converged"
     named = any(inspection.weakest.sentence in reason for reason in [*result.reasons, *weak])
     plan = inspection.plan
