@@ -41,7 +41,6 @@ from sst_graph.report.html import (
     preformatted,
     section,
     table,
-    text,
 )
 from sst_graph.report.overlay import Placements, overlay
 from sst_graph.report.residual_charts import broad_charts, residual_charts
@@ -155,7 +154,7 @@ def _verdict(inputs: ReportInputs) -> str:
     return section(
         "verdict",
         "Verdict",
-        f'<p class="verdict {result.status}">{text(verdict(result))}</p>',
+        paragraph(verdict(result), f"verdict {result.status}"),
         paragraph(capitalized(fit) + ".") if fit else "",
         paragraph(_CHECK) if fit and result.fit_is_check else "",
         "" if of_start or result.status == "not_converged" else _accuracy(result),
@@ -379,7 +378,13 @@ def _assumptions(result: CalibrationResult) -> str:
     if not rows:
         return ""
     head = ("assumption", "by the data", "considered", "verdict", "what it would mean if it did not hold")
-    return "<h3>Assumptions</h3>" + table(head, rows, "stacked")
+    return "<h3>Assumptions</h3>" + paragraph(_CONSIDERED, "note") + table(head, rows, "stacked")
+
+
+_CONSIDERED = (
+    "By the data: the parameter's estimate and its standard deviation; 0 is what is assumed. Considered: how "
+    "far it may be off (one standard deviation) with its effect counted in the sigmas of the result."
+)
 
 
 def _assumption_row(name: str, entry: Mapping[str, Any], covered: Mapping[str, float]) -> tuple[str, ...]:
