@@ -32,6 +32,7 @@ from sst_graph.covariance.error_model import fit_error_model
 from sst_graph.covariance.image_shifts import columns_by_image, shifts_of
 from sst_graph.covariance.match_table import MatchTable, match_table
 from sst_graph.covariance.observability import weak_directions
+from sst_graph.drive.stages import under
 from sst_graph.errors import EstimationError
 from sst_graph.graph.building import state_from
 from sst_graph.graph.elimination import Eliminated, Unknowns
@@ -121,7 +122,12 @@ class SolvedProblem:
         """
         free, centre = self.problem.joint().estimating(names), self.problem.prior_centre(self.solution.state)
         config = replace(free.config, max_outer=most_outer)
-        return solve_joint(replace(free, config=config, centre=centre), start, kernels_px)
+        return solve_joint(
+            replace(free, config=config, centre=centre),
+            start,
+            kernels_px,
+            under(self.problem.progress, "assumptions"),
+        )
 
 
 FurtherTests = Callable[[CalibrationProblem, State, Sequence[ParameterTest]], tuple[ParameterTest, ...]]

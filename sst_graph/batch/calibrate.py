@@ -56,6 +56,7 @@ from sst_graph.drive.preparation import (
     check_progress,
     prepare_drive,
 )
+from sst_graph.drive.stages import begin
 from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.floating_point import with_usual_errors
 from sst_graph.marginal import MOST_SCAN_HASHES, SCAN_HASHES
@@ -120,10 +121,16 @@ def prepare_drives(
     if config.method == "edges":
         sources = [GeometricallyLabelled(source) for source in sources]
     # One drive after the other, for the frames that the sweep is decided by are kept until they are read.
+    swept = (with_sweep(source, config.decide_sweep, _of_sweep(source, progress)) for source in sources)
     return [
         prepare_drive(source, prepared_classes(config), prepare, progress, depth, with_lower_edges)
-        for source in (with_sweep(source, config.decide_sweep) for source in sources)
+        for source in swept
     ]
+
+
+def _of_sweep(source: Source, progress: Progress | None) -> Callable[[int, int], None] | None:
+    """The progress of the decision about a source's sweep."""
+    return None if progress is None else partial(progress, f"sweep of {source.name}")
 
 
 def preparation_of(config: CalibrationConfig) -> PrepareConfig:
@@ -150,11 +157,15 @@ def calibrate_prepared(
     config = with_method_of(config or CalibrationConfig(), drives)
     guess = Guess(initial, initial_time_offset_s)
     method = _METHODS[config.method]
-    return finished(lambda: method(drives, guess, config, progress), drives, guess, config)[0]
+    return finished(lambda: method(drives, guess, config, progress), drives, guess, config, progress)[0]
 
 
 def finished(
-    run: Callable[[], MethodEstimate], drives: Sequence[Drive], guess: Guess, config: CalibrationConfig
+    run: Callable[[], MethodEstimate],
+    drives: Sequence[Drive],
+    guess: Guess,
+    config: CalibrationConfig,
+    progress: Progress | None = None,
 ) -> tuple[CalibrationResult, MethodEstimate | None]:
     """The result of what ``run`` estimates, and the estimate itself; None where it finds none."""
     began = time.perf_counter()
@@ -165,7 +176,7 @@ def finished(
     except EstimationError as error:
         result = guess_as_result(drives, guess, config, str(error))
     # Likely faults of the data become the first reasons.
-    result = with_causes(result, drives, guess, config)
+    result = with_causes(result, drives, guess, config, progress)
     diagnostics = {**result.diagnostics, "seconds": {"estimate": time.perf_counter() - began}}
     left_out = {drive.name: drive.left_out.counts() for drive in drives if drive.left_out.counts()}
     if left_out:
@@ -227,8 +238,10 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
     # 6. Assumptions: tested against the data, considered in the covariance.
     tests, considered = examine_assumptions(problem, motion.estimate, lens_beside_labels)
     # 7. Total covariance: with pictures that shift, unmeasured motion and undecided sweeps.
+    begin(problem.progress, "covariance")
     total = total_covariance(problem, motion.estimate, considered)
     # 8. How it fits the labels, point by point.
+    begin(problem.progress, "fit of the labels")
     fit = fit_of(problem, (start_solution, lower.solutions[0], motion.estimate.solution), total.covariance)
     # 9. The estimate, and why it may be wrong.
     solution, unknowns = motion.estimate.solution, total.unknowns

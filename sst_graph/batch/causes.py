@@ -23,7 +23,8 @@ from sst_graph.diagnosis import (
     uncalibrated,
     unknown_lasers,
 )
-from sst_graph.drive.preparation import Drive
+from sst_graph.drive.preparation import Drive, Progress
+from sst_graph.drive.stages import begin, run_stage, under
 from sst_graph.errors import EstimationError
 from sst_graph.graph.drive_motion import motions_of
 from sst_graph.graph.outer_loop import (
@@ -36,11 +37,12 @@ from sst_graph.graph.outer_loop import (
 from sst_graph.graph.state import State
 from sst_graph.initialization.candidates import StartProblem, prior_centre
 from sst_graph.initialization.selection import select_start_steps
-from sst_graph.result import CalibrationResult
+from sst_graph.result import LIKELY_CAUSES, CalibrationResult
 from sst_graph.sampling import step_for
-from sst_graph.stepwise import run_to_end
 from sst_graph.types import Guess
 
+CAUSES = "likely causes"
+"""Name of this stage of a calibration."""
 _AGREED = 0.3
 """Share of the outlines that meet, times that of close matches, above which no mirror is looked for: mirrored
 streets have 0.1 to 0.2."""
@@ -51,10 +53,15 @@ _SCANS, _CANDIDATES = 6, 160
 
 
 def with_causes(
-    result: CalibrationResult, drives: Sequence[Drive], guess: Guess, config: CalibrationConfig
+    result: CalibrationResult,
+    drives: Sequence[Drive],
+    guess: Guess,
+    config: CalibrationConfig,
+    progress: Progress | None = None,
 ) -> CalibrationResult:
     """The result with what is probably wrong with the data as its first reasons; with any, it is not ok. What
     may be wrong and does not show is a remark."""
+    begin(progress, CAUSES)
     by_labels = config.method not in ("motion", "edges", "both")
     found = preflight(drives, guess, config.classes if by_labels else ())
     causes = [*_wrong_sweeps(drives), *(finding.sentence for finding in found)]
@@ -66,7 +73,8 @@ def with_causes(
         camera = other_camera(guess.cTl, result.T_camera_lidar, result.covariance, by_labels)
         causes = [] if camera is None else [camera.sentence]
     if not causes and config.find_causes and config.method == "joint":
-        causes = [finding.sentence for finding in _fault_hypotheses(result, drives, guess, config)]
+        fit = fit_labels(config, progress)
+        causes = [finding.sentence for finding in _fault_hypotheses(result, drives, guess, fit)]
     if not causes and config.find_causes and result.status != "ok" and config.method in ("edges", "both"):
         by_edges = drives if config.method == "edges" else split_by_labels(drives)[1]
         inverted = inverted_start(by_edges, guess, config)
@@ -76,7 +84,9 @@ def with_causes(
         result = replace(result, reasons=(*result.reasons, *remarks))
     if causes:
         status = "not_converged" if estimated else result.status
-        result = replace(result, status=status, reasons=(*causes, *result.reasons))
+        diagnostics = {**result.diagnostics, LIKELY_CAUSES: causes}
+        reasons = (*causes, *result.reasons)
+        result = replace(result, status=status, reasons=reasons, diagnostics=diagnostics)
     return _with_unlabelled_frames(result, drives, config)
 
 
@@ -125,10 +135,9 @@ def _relies_on_principal_point(assumptions: AssumptionConfig) -> bool:
 
 
 def _fault_hypotheses(
-    result: CalibrationResult, drives: Sequence[Drive], guess: Guess, config: CalibrationConfig
+    result: CalibrationResult, drives: Sequence[Drive], guess: Guess, fit: Fitter
 ) -> tuple[Finding, ...]:
     """What explains a result that is missing, may be wrong, or agrees with few of the labels."""
-    fit = fit_labels(config)
     if not result.frames_used:
         return likely_causes(drives, guess, fit)
     explained, concentration = (float(result.diagnostics[key]) for key in ("explained", "concentration"))
@@ -138,7 +147,7 @@ def _fault_hypotheses(
     return mirror(drives, guess, fit, solved) if explained * concentration < _AGREED else ()
 
 
-def fit_labels(config: CalibrationConfig) -> Fitter:
+def fit_labels(config: CalibrationConfig, progress: Progress | None = None) -> Fitter:
     """Search and short solution on a few scans of one drive, with a calibration's own settings."""
 
     def fit(drive: Drive, guess: Guess) -> LabelFit | None:
@@ -147,13 +156,12 @@ def fit_labels(config: CalibrationConfig) -> Fitter:
         joint = replace(config.joint, max_outer=len(NARROW_KERNELS_PX))
         search = StartProblem(few, motions, config.classes, guess)
         try:
-            selection = run_to_end(
-                select_start_steps(search, joint.graph, config.search, _SCANS, _CANDIDATES)
-            )
+            steps = select_start_steps(search, joint.graph, config.search, _SCANS, _CANDIDATES)
+            selection = run_stage(steps, progress, CAUSES)
             cTl, found_s = selection.starts[0]
             start = State(cTl, (found_s,))
             problem = JointProblem(few, motions, joint, prior_centre(guess, start))
-            solution = solve_joint(problem, start, NARROW_KERNELS_PX)
+            solution = solve_joint(problem, start, NARROW_KERNELS_PX, under(progress, CAUSES))
         except EstimationError:
             return None
         return LabelFit(

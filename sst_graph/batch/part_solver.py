@@ -10,6 +10,7 @@ import numpy as np
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.covariance.contradiction import PartEstimate
 from sst_graph.drive.preparation import Drive
+from sst_graph.drive.stages import begin
 from sst_graph.errors import EstimationError
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.drive_motion import DriveMotion
@@ -119,6 +120,7 @@ class PartSolver:
         drive, motion = self._data(part)
         try:
             problem = JointProblem([drive], [motion], joint, self.reference_of(part))
+            begin(self.problem.progress, "contradictions between frames")
             solution = solve_joint(problem, start, kernels_px)
             return SolvedPart(part, solution.state, self._step(part, solution))
         except (EstimationError, np.linalg.LinAlgError):

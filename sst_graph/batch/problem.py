@@ -12,6 +12,7 @@ from sst_graph.covariance.cluster_robust import RobustCovariance, robust_covaria
 from sst_graph.covariance.considered import AssumptionConfig, Considered, considered_by_matches
 from sst_graph.covariance.static_objects import static_covariance
 from sst_graph.drive.preparation import Drive, Progress
+from sst_graph.drive.stages import run_stage
 from sst_graph.fit import Fit, OuterIteration, Profile
 from sst_graph.graph.drive_motion import DriveMotion, motions_of
 from sst_graph.graph.outer_loop import (
@@ -26,7 +27,6 @@ from sst_graph.initialization.candidates import StartProblem, prior_centre
 from sst_graph.initialization.selection import Selection, alternatives, select_start_steps
 from sst_graph.objects.tracks import ObjectId, object_tracks
 from sst_graph.quality.fit_of_solution import FitOfDrives
-from sst_graph.stepwise import run_to_end
 from sst_graph.types import Calibration, FloatArray, Guess
 
 
@@ -106,7 +106,8 @@ class CalibrationProblem:
         """
         # Objects have no bias of their own yet.
         problem = StartProblem(self.drives, motions_of(self.drives), self.config.classes, self.guess)
-        return run_to_end(select_start_steps(problem, self.config.noise, self.config.search))
+        steps = select_start_steps(problem, self.config.noise, self.config.search)
+        return run_stage(steps, self.progress, "search of the start")
 
     def with_lower_edges(self, solutions: Sequence[JointSolution]) -> WithLowerEdges:
         """Solutions with the lower edges of classes whose labels agree about them.

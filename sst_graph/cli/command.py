@@ -8,6 +8,7 @@ import keyword
 import logging
 import os
 import sys
+import time
 import traceback
 from collections.abc import Sequence
 
@@ -18,7 +19,7 @@ from sst_graph.cli import (
     EXIT_NOT_WRITTEN,
     EXIT_READER_GONE,
 )
-from sst_graph.cli.messages import StreamError, complain, flush, loudness
+from sst_graph.cli.messages import StreamError, complain, flush, loading, loudness
 from sst_graph.cli.options import build_parser
 from sst_graph.errors import ConfigError, SstGraphError, printable
 
@@ -91,9 +92,11 @@ def _run(argv: Sequence[str], own_process: bool) -> int:
             raise ConfigError(f"argument {argument!r:.60}: found a NUL character, expected none")
     args = build_parser().parse_args(argv)
     loudness.quiet, loudness.lines = args.quiet, own_process
+    loudness.began_s = time.monotonic() if own_process else None
     _set_up_logging(args.verbose)
     name = f"{args.command}_" if keyword.iskeyword(args.command) else args.command
-    command = importlib.import_module(f"sst_graph.cli.commands.{name}")
+    with loading(args.command):
+        command = importlib.import_module(f"sst_graph.cli.commands.{name}")
     code: int = command.run(args)
     return code
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import errno
 import os
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TextIO
 
@@ -42,10 +43,12 @@ class Loudness:
     Attributes:
         quiet: neither progress nor what :func:`mention` is given.
         lines: progress in plain lines where stderr is no terminal.
+        began_s: when the command began, by :func:`time.monotonic`, in a process of its own [s].
     """
 
     quiet: bool = False
     lines: bool = False
+    began_s: float | None = None
 
 
 loudness = Loudness()
@@ -79,10 +82,28 @@ def _discard_stdout() -> None:
 
 def complain(text: str) -> None:
     """One line on stderr, whatever the text holds."""
+    _on_stderr("sst-graph: " + " ".join(text.split()) + "\n")
+
+
+def _on_stderr(text: str) -> None:
     # Where nobody reads it, the exit code still says it.
     with suppress(OSError, ValueError):
-        sys.stderr.write(_shown("sst-graph: " + " ".join(text.split()) + "\n", sys.stderr))
+        sys.stderr.write(_shown(text, sys.stderr))
         sys.stderr.flush()
+
+
+@contextmanager
+def loading(command: str) -> Iterator[None]:
+    """Words in a terminal's line while a command's modules are loaded: seconds on a busy machine."""
+    shown = loudness.lines and not loudness.quiet and sys.stderr.isatty()
+    words = f"sst-graph {command}: loading"
+    if shown:
+        _on_stderr(words)
+    try:
+        yield
+    finally:
+        if shown:
+            _on_stderr(f"\r{' ' * len(words)}\r")
 
 
 def flush() -> None:

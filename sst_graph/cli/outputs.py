@@ -11,12 +11,13 @@ from typing import Any
 from sst_graph.cli import EXIT_NOT_TRUSTED
 from sst_graph.cli.messages import complain, loudness
 from sst_graph.cli.pictures import ShownFrame, overlay, png, telling_positions
-from sst_graph.cli.progress import ProgressBar, ProgressStage
+from sst_graph.cli.progress import ProgressBar
 from sst_graph.data.frame_parts import RecentReader
 from sst_graph.files import OutputKind
 from sst_graph.inspect.inspection import inspect_result, to_dict
-from sst_graph.inspect.reasons import MOST_REASONS, short_reasons
+from sst_graph.inspect.reasons import MOST_REASONS, leading_reasons, short_reasons
 from sst_graph.inspect.report import OWN_CALIBRATION, ReferenceErrors, markdown_report
+from sst_graph.inspect.verdict import is_start
 from sst_graph.metrics import calibration_errors
 from sst_graph.odometry.sweep import with_sweep_of
 from sst_graph.report import ReportInputs, report_html
@@ -39,6 +40,8 @@ def comparison(result: CalibrationResult, sources: Sequence[Source]) -> Referenc
     if truth is None:
         return None
     reference = bool(getattr(sources[0], "truth_is_reference", False))
+    if is_start(result) and result.T_camera_lidar.equals(truth.cTl, 1e-9):
+        return None  # the start is this very transform: no errors are found in it
     errors = calibration_errors(
         result.T_camera_lidar,
         result.time_offset_s,
@@ -61,8 +64,7 @@ def write_calibration(
         with_report: write the page with pictures and charts, too.
     """
     with ProgressBar() as progress:
-        stage = progress.stage("pictures and report")
-        return _written(folder, result, sources, against, with_report, stage)
+        return _written(folder, result, sources, against, with_report, progress)
 
 
 def _written(
@@ -71,10 +73,10 @@ def _written(
     sources: Sequence[Source],
     against: ReferenceErrors | None,
     with_report: bool,
-    progress: ProgressStage,
+    progress: ProgressBar,
 ) -> list[str]:
     pictures, frames, shown_frames = [], [], []
-    progress(0, PICTURES + 1)
+    progress("pictures", 0, PICTURES)
     read = [with_sweep_of(source, result.diagnostics) for source in sources]
     for source, swept, plain in zip(sources, read, _file_names(sources), strict=True):
         drive = RecentReader(swept)
@@ -86,16 +88,15 @@ def _written(
             if with_report and result.fit is None:  # else the report chooses by the fit
                 frames.append(shown.drawn())
             pictures.append(name)
-            progress(len(pictures), PICTURES + 1)
+            progress("pictures", len(pictures), max(PICTURES, len(pictures)))
     (folder / RESULT_NAME).write_text(result.to_json(), encoding="utf-8")
     markdown = markdown_report(result, against, pictures, legend_of(shown_frames))
     (folder / "report.md").write_text(markdown, encoding="utf-8")
     if not with_report:
         return [RESULT_NAME, "report.md", *pictures]
     drawn = [one for one in frames if one is not None]
-    page = report_html(ReportInputs(result, read, against, drawn))
+    page = report_html(ReportInputs(result, read, against, drawn), progress.stage("report"))
     (folder / REPORT_NAME).write_text(page, encoding="utf-8")
-    progress(PICTURES + 1, PICTURES + 1)
     return [RESULT_NAME, REPORT_NAME, "report.md", *pictures]
 
 
@@ -124,6 +125,8 @@ def exit_code(result: CalibrationResult) -> int:
 def why_not_ok(result: CalibrationResult) -> str:
     """Status and first reason of a result that is not ok, in one line."""
     first, *others = short_reasons(result) or ("the result carries no reason",)
+    if consequences := leading_reasons(result)[1]:
+        return f"{result.status}: {first} ({consequences}; in the report)"
     in_summary = not loudness.quiet and len(others) < MOST_REASONS
     where = "in the summary; in full in the report" if in_summary else "in the report"
     more = f" ({len(others)} more {where})" if others else ""

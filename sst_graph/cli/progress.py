@@ -30,7 +30,8 @@ class ProgressBar:
     def __init__(self) -> None:
         self._bar: tqdm | None = None
         self._stage, self._total = "", 0
-        self._next_line_s = time.monotonic() + FIRST_S
+        began_s = time.monotonic() if loudness.began_s is None else loudness.began_s
+        self._next_line_s = began_s + FIRST_S
 
     def __enter__(self) -> ProgressBar:
         return self
@@ -41,12 +42,20 @@ class ProgressBar:
         self._close()
 
     def __call__(self, stage: str, done: int, total: int) -> None:
-        """``done`` of ``total`` steps of ``stage`` are behind us."""
+        """``done`` of ``total`` steps of ``stage`` are behind us; of one step, which may be told again while
+        it goes on, the time is shown."""
         if self._bar is None or stage != self._stage or total != self._total:
             self._close()
             self._stage, self._total = stage, total
             hidden = True if loudness.quiet else None  # None: hidden where stderr is no terminal
-            self._bar = tqdm(total=total, desc=stage, file=sys.stderr, disable=hidden, leave=False)
+            self._bar = tqdm(
+                total=total,
+                desc=stage,
+                file=sys.stderr,
+                disable=hidden,
+                leave=False,
+                bar_format="{desc} [{elapsed}]" if total == 1 else None,
+            )
         if self._bar.disable:
             self._say_line(done)
         else:
@@ -61,7 +70,8 @@ class ProgressBar:
         if loudness.lines and not loudness.quiet and now_s >= self._next_line_s and self._total:
             self._next_line_s = now_s + EVERY_S
             share = round(100.0 * done / self._total)
-            complain(f"{PREFIX}{self._stage}: {done} of {self._total} ({share} %)")
+            counted = f": {done} of {self._total} ({share} %)" if done or self._total > 1 else ""
+            complain(f"{PREFIX}{self._stage}{counted}")
 
     def _close(self) -> None:
         if self._bar is not None:

@@ -241,6 +241,8 @@ def solve_joint_steps(
             if share * step < step_sigmas:
                 converged = step < OSCILLATION_SIGMAS
                 break
+    if progress is not None:
+        progress("solve", config.max_outer, config.max_outer)
     _LOG.info("joint: %d outer iterations, %d pairs", outer + 1, pairs)
     return JointSolution(
         state, matches, outer + 1, converged, frozen, optimum, tuple(iterations), problem, centre

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from sst_graph.inspect.budget_text import budget_lines, estimated_lines
-from sst_graph.inspect.reasons import MOST_REASONS, short_reasons
+from sst_graph.inspect.reasons import MOST_REASONS, leading_reasons
 from sst_graph.inspect.verdict import figure, fit_line, is_start, verdict
 from sst_graph.metrics import (
     CalibrationErrors,
@@ -18,7 +18,7 @@ from sst_graph.metrics import (
     mean_translation_difference_m,
     quaternion_angle_deg,
 )
-from sst_graph.result import CalibrationResult
+from sst_graph.result import LIKELY_CAUSES, CalibrationResult
 
 OFFSET_SIGN = "t_lidar = t_camera_stamp + offset"
 
@@ -106,8 +106,10 @@ def summary_rows(
         rows.append((f"{'start ' * is_start(result)}against {comparison.name}", ""))
         rows += [("", line) for line in error_lines(comparison.errors)]
     rows += [("fit", fit)] if (fit := fit_line(result)) else []
-    reasons = short_reasons(result)
+    reasons, others = leading_reasons(result)
     rows += [("reason", reason) for reason in reasons[:MOST_REASONS]]
+    if others:
+        rows.append(("", f"{others}: in the result's file"))
     if len(reasons) > MOST_REASONS:
         rows.append(("", f"and {len(reasons) - MOST_REASONS} more: reasons in the result's file"))
     for weak in result.weak_directions:
@@ -146,10 +148,13 @@ def markdown_report(
         pictures: file names beside it.
         legend: sentences about what is drawn in them.
     """
+    _, others = leading_reasons(result)
+    causes = [one for one in result.reasons if one in result.diagnostics.get(LIKELY_CAUSES, ())]
+    said = [*causes, f"{others} (below)"] if others else result.reasons
     blocks = [
         "# Calibration",
         verdict(result),
-        f"Status: **{result.status}**{': ' * bool(result.reasons)}{'; '.join(result.reasons)}",
+        f"Status: **{result.status}**{': ' * bool(said)}{'; '.join(said)}",
         _table(
             ("", "value", "sigma"),
             [
@@ -168,7 +173,9 @@ def markdown_report(
             "```\n" + "\n".join(parts) + "\n```",
             _WITHOUT_LABELS if result.method == "edges" else _WITH_LABELS,
         ]
-    if result.weak_directions:
+    if others:
+        blocks += ["## All reasons", "\n".join(f"- {reason}" for reason in result.reasons)]
+    elif result.weak_directions:
         items = [f"- {weak.sentence} {weak.advice}" for weak in result.weak_directions]
         blocks += ["## What the data hardly determine", "\n".join(items)]
     if pictures:

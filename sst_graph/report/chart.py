@@ -20,7 +20,8 @@ from sst_graph.viz.matplotlib_figure import figure_class
 WIDTH, HEIGHT = 400, 260
 """Of a chart, in its own units: the page stretches it. Text is 13 units high, as in page.css."""
 BROAD = 1000
-"""Width of a chart that is as wide as a broad page, in the same units."""
+"""Width of a chart of which one is as wide as a broad page, in the same units: in so many pixels its letters
+are as large as those of charts that stand beside each other."""
 _RIGHT, _TOP, _BOTTOM = 14, 12, 44
 _TICKS, _WHOLE_TICKS = 5, 16
 _COLOURS = {

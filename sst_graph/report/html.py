@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+import re
 from collections.abc import Iterable, Sequence
 from importlib.resources import files
 
@@ -17,6 +18,14 @@ _JPEG_QUALITY = 82
 def text(words: str) -> str:
     """Words as text of a page, or of an attribute in double quotes."""
     return html.escape(printable(words), quote=True)
+
+
+_OPTION = re.compile(r"--[a-z][a-z-]*")
+
+
+def prose(words: str) -> str:
+    """Words as text of a page alone, in which no line ends within the name of an option."""
+    return _OPTION.sub(r'<span class="option">\g<0></span>', text(words))
 
 
 def printable(words: str) -> str:
@@ -48,11 +57,11 @@ def section(name: str, title: str, *blocks: str) -> str:
 
 
 def paragraph(words: str, kind: str = "") -> str:
-    return f'<p class="{kind}">{text(words)}</p>' if kind else f"<p>{text(words)}</p>"
+    return f'<p class="{kind}">{prose(words)}</p>' if kind else f"<p>{prose(words)}</p>"
 
 
 def bullets(lines: Iterable[str]) -> str:
-    items = "".join(f"<li>{text(line)}</li>" for line in lines)
+    items = "".join(f"<li>{prose(line)}</li>" for line in lines)
     return f"<ul>{items}</ul>" if items else ""
 
 
@@ -89,7 +98,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") ->
     body = "".join(
         f'<tr><th scope="row">{text(first)}</th>'
         + "".join(
-            (f'<td data-head="{text(name)}">' if kind == "stacked" else "<td>") + f"{text(cell)}</td>"
+            (f'<td data-head="{text(name)}">' if kind == "stacked" else "<td>") + f"{prose(cell)}</td>"
             for name, cell in zip(head[1:], cells, strict=True)
         )
         + "</tr>"
@@ -104,7 +113,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") ->
 def lines(rows: Iterable[tuple[str, str]]) -> str:
     """Lines of a terminal: names, and texts whose spaces count; one without a name continues another."""
     body = "".join(
-        f'<tr><th scope="row">{text(name)}</th><td>{text(line)}</td></tr>'
+        f'<tr><th scope="row">{text(name)}</th><td>{prose(line)}</td></tr>'
         if line
         else f'<tr><th scope="row" colspan="2">{text(name)}</th></tr>'
         for name, line in rows

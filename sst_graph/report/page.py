@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from sst_graph.inspect.inspection_text import (
     weakest_ratio,
 )
 from sst_graph.inspect.misfit import DRIVING_MPS, misfits
-from sst_graph.inspect.reasons import as_sentence, capitalized, short_reasons
+from sst_graph.inspect.reasons import as_sentence, capitalized, leading_reasons
 from sst_graph.inspect.report import ReferenceErrors, error_lines, summary_rows
 from sst_graph.inspect.verdict import RIGHT_OVER_CHANCE, figure, fit_line, is_start, verdict
 from sst_graph.report.close_ups import ZOOM, close_ups
@@ -40,7 +41,6 @@ from sst_graph.report.html import (
     preformatted,
     section,
     table,
-    text,
 )
 from sst_graph.report.overlay import Placements, overlay
 from sst_graph.report.residual_charts import broad_charts, residual_charts
@@ -116,23 +116,31 @@ class ReportInputs:
     frames: Sequence[DrawnFrame] = ()
 
 
-def report_html(inputs: ReportInputs) -> str:
+def report_html(inputs: ReportInputs, progress: Callable[[int, int], None] | None = None) -> str:
     """The page: nothing in it is loaded from elsewhere.
+
+    Args:
+        progress: called with (parts done, parts in all).
 
     Raises:
         DataError: the drives cannot be read again.
     """
     result, reader = inputs.result, DriveReader(inputs.sources)
     inspection = inspect_result(result)
-    body = [
-        _verdict(inputs),
-        _next(inspection),
-        _pictures(inputs, reader),
-        *(_close_ups(inputs, fit, reader) for fit in result.fits),
-        *(_residuals(result, fit) for fit in result.fits),
-        _likelihood(inspection),
-        _background(inputs, inspection),
+    parts: list[Callable[[], str]] = [
+        lambda: _verdict(inputs),
+        lambda: _next(inspection),
+        lambda: _pictures(inputs, reader),
+        *(partial(_close_ups, inputs, fit, reader) for fit in result.fits),
+        *(partial(_residuals, result, fit) for fit in result.fits),
+        lambda: _likelihood(inspection),
+        lambda: _background(inputs, inspection),
     ]
+    body = []
+    for done, part in enumerate(parts):
+        if progress is not None:
+            progress(done, len(parts))
+        body.append(part())
     drives = ", ".join(sorted({frame.drive for frame in result.frames_used}))
     title = f"Calibration of {result.image_topic or result.camera_name}" + (
         f" from {drives}" if drives else ""
@@ -146,7 +154,7 @@ def _verdict(inputs: ReportInputs) -> str:
     return section(
         "verdict",
         "Verdict",
-        f'<p class="verdict {result.status}">{text(verdict(result))}</p>',
+        paragraph(verdict(result), f"verdict {result.status}"),
         paragraph(capitalized(fit) + ".") if fit else "",
         paragraph(_CHECK) if fit and result.fit_is_check else "",
         "" if of_start or result.status == "not_converged" else _accuracy(result),
@@ -193,7 +201,10 @@ def _next(inspection: Inspection) -> str:
         for one in result.weak_directions
         if not any(one.sentence in reason for reason in result.reasons)
     ]
-    short = [as_sentence(capitalized(reason)) for reason in short_reasons(result)]
+    reasons, others = leading_reasons(result)
+    short = [as_sentence(capitalized(reason)) for reason in reasons]
+    if others:
+        short.append(f"{others}.")
     trusted = result.status != "not_converged"
     named = any(inspection.weakest.sentence in reason for reason in [*result.reasons, *weak])
     plan = inspection.plan
@@ -367,7 +378,13 @@ def _assumptions(result: CalibrationResult) -> str:
     if not rows:
         return ""
     head = ("assumption", "by the data", "considered", "verdict", "what it would mean if it did not hold")
-    return "<h3>Assumptions</h3>" + table(head, rows, "stacked")
+    return "<h3>Assumptions</h3>" + paragraph(_CONSIDERED, "note") + table(head, rows, "stacked")
+
+
+_CONSIDERED = (
+    "By the data: the parameter's estimate and its standard deviation; 0 is what is assumed. Considered: how "
+    "far it may be off (one standard deviation) with its effect counted in the sigmas of the result."
+)
 
 
 def _assumption_row(name: str, entry: Mapping[str, Any], covered: Mapping[str, float]) -> tuple[str, ...]:

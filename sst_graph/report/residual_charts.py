@@ -225,9 +225,10 @@ def _over_picture(fit: Fit, camera: PinholeCamera) -> str:
     at, by = np.array(places), np.array(shifts)
     longest = max(0.5, float(np.linalg.norm(by, axis=1).max()))
     enlarged = float(f"{0.09 * camera.width / longest:.1g}")
+    (left, top), (right, bottom) = _around(camera, at + enlarged * by).tolist()
     chart = Chart(
-        (0.0, camera.width),
-        (0.0, camera.height),
+        (left, right),
+        (top, bottom),
         ("column [px]", "row [px]"),
         f"Mean shift of the points against the {_edge_name(fit)}, over the picture",
         down=True,
@@ -244,6 +245,17 @@ def _over_picture(fit: Fit, camera: PinholeCamera) -> str:
         f"{least} points.",
         kind="wide",
     )
+
+
+def _around(camera: PinholeCamera, ends: FloatArray) -> FloatArray:
+    """(2, 2) first and last column and row of a picture, farther out where ends (n, 2) of arrows leave it."""
+    margin, size = _BESIDE_PX, np.array([camera.width, camera.height], np.float64)
+    low, high = ends.min(axis=0) - margin, ends.max(axis=0) + margin
+    return np.array([np.minimum(0.0, low), np.maximum(size, high)])
+
+
+_BESIDE_PX = 6.0
+"""Room around the ends of arrows, which have heads [px]."""
 
 
 def _binned(points: PointResiduals, values: FloatArray, label: str, title: str, caption: str) -> str:

@@ -252,7 +252,7 @@ def _solved(problem: CalibrationProblem, start: Guess | None = None) -> _Camera:
             problem.config.search, rotation_deg=_NEAR_DEG, translation_m=_NEAR_M, time_offset_s=_NEAR_S
         )
         own = replace(problem, guess=start, config=replace(problem.config, search=search))
-    result, estimate = finished(lambda: _estimate(own), own.drives, own.guess, own.config)
+    result, estimate = finished(lambda: _estimate(own), own.drives, own.guess, own.config, own.progress)
     if start is not None:
         config = {**result.config, "search": to_dict(problem.config.search)}
         guess = problem.guess

@@ -16,11 +16,13 @@ import numpy as np
 import pytest
 from stored import written
 
+from sst_graph.batch import CalibrationConfig, calibrate
 from sst_graph.cli import main
 from sst_graph.cli.messages import Loudness, loudness
 from sst_graph.cli.progress import EVERY_S, FIRST_S, ProgressBar, counted
+from sst_graph.drive.stages import begin
 from sst_graph.result import read_result
-from sst_graph.simulator import SimulationConfig
+from sst_graph.simulator import SimulationConfig, simulate
 
 SMALL = ["--frames", "2", "--set", "width=160", "--set", "height=64", "--set", "azimuth_step_deg=2"]
 
@@ -63,6 +65,33 @@ def test_short_stages_count_together(
             progress(f"stage {k}", 1, 1)
     said = capsys.readouterr().err.splitlines()
     assert said == [f"sst-graph: progress: stage {k}: 1 of 1 (100 %)" for k in told]
+
+
+@pytest.mark.usefixtures("lines")
+def test_a_stage_of_one_step_has_lines_while_it_goes_on(
+    clock: list[float], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And the time of loading counts: where that was long, the first stage is said at once."""
+    monkeypatch.setattr(loudness, "began_s", 97.0)
+    with ProgressBar() as progress:
+        for _ in range(25):
+            begin(progress, "search")
+            clock[0] += 1.0
+        progress("search", 1, 1)
+    said = capsys.readouterr().err.splitlines()
+    assert said == ["sst-graph: progress: search"] * 3
+
+
+@pytest.mark.slow
+def test_the_stages_of_a_calibration_have_names() -> None:
+    street = SimulationConfig(
+        seed=4, frames=4, width=276, height=84, azimuth_step_deg=0.5, vehicle_density=0.3
+    )
+    told: list[tuple[str, int, int]] = []
+    calibrate(simulate(street), config=CalibrationConfig(), progress=lambda *step: told.append(step))
+    names = [*dict.fromkeys(stage for stage, _, _ in told)]
+    assert {"search of the start", "solve"} <= {*names} and names[-1] == "likely causes"
+    assert all(0 <= done <= total and total > 0 for _, done, total in told)
 
 
 def test_nothing_is_said_in_a_process_of_others(

@@ -151,6 +151,26 @@ def test_bad_input_is_named_on_one_line(drive: Path, damage: Damage, message: st
     assert "expected" in str(caught.value)
 
 
+@pytest.mark.parametrize(("factor", "odd"), [(0.5, PICTURE), (0.75, PICTURE), (2.0, PICTURE), (0.5, MASK)])
+def test_of_pictures_and_masks_the_scaled_ones_are_named(factor: float, odd: str, drive: Path) -> None:
+    """The principal point tells: it is near the middle of those that it was made for."""
+    calibration = drive / "calib.txt"
+    lines = calibration.read_text().splitlines()
+    lines = ["P2: 700 0 41 0 0 700 29 0 0 0 1 0" if line.startswith("P2") else line for line in lines]
+    calibration.write_text("\n".join(lines) + "\n")
+    for folder, channels in ((PICTURE, (3,)), (MASK, ())):
+        width, height = (round(side * (factor if folder == odd else 1.0)) for side in (80, 60))
+        for path in (drive / folder).parent.glob("*.png"):
+            cv2.imwrite(str(path), np.zeros((height, width, *channels), np.uint8))
+    with pytest.raises(DataError) as caught:
+        read_all(drive)
+    said, scaled = str(caught.value), f"{80 * factor:.0f}x{60 * factor:.0f} px"
+    assert f"{Path(odd).parent}/0" in said and scaled in said.partition("expected")[0]
+    assert "80x60 px" in said.partition("expected")[2] and len(said) < 390
+    if odd == PICTURE:
+        assert f"if the pictures were scaled, scale fx and cx by {factor:g}, fy and cy by {factor:g}" in said
+
+
 @pytest.mark.parametrize(
     ("values", "message"),
     [

@@ -202,8 +202,11 @@ def _hall(
 def test_the_sweep_of_a_hall(
     fraction: float, start_deg: float, yaw_rate: float, limit_deg: float, kind: str
 ) -> None:
-    found = decide_sweep(_hall(6.0, fraction, start_deg, yaw_rate, limit_deg), 14)
+    told: list[tuple[int, int]] = []
+    hall = _hall(6.0, fraction, start_deg, yaw_rate, limit_deg)
+    found = decide_sweep(hall, 14, progress=lambda *steps: told.append(steps))
     assert found.kind == kind, found.sentence
+    assert told == sorted(told) and told[0][0] == 0 and len(told) > 6 and told[-1][0] < told[-1][1]
     assert abs(found.fraction - fraction) < 0.2
     assert found.timing.fraction == fraction and found.timing.period_s == pytest.approx(0.1)
     if limit_deg == 180.0 and fraction != 0.0:

@@ -163,13 +163,15 @@ PROBE = (
 """Tells the outer page what the report has become."""
 
 
-def _opened(folder: Path, page: str, width: int, dark: bool) -> tuple[dict[str, Any], str]:
+def _opened(
+    folder: Path, page: str, width: int, dark: bool, probe: str = PROBE
+) -> tuple[dict[str, Any], str]:
     """What the probe found in a browser, and the browser's log.
 
     The report stands in a frame: a window is 500 px wide at least.
     """
     outer = folder / "outer.html"
-    style, inner = f"width:{width}px;height:900px;border:0", html.escape(page + PROBE)
+    style, inner = f"width:{width}px;height:900px;border:0", html.escape(page + probe)
     outer.write_text(f'<iframe style="{style}" srcdoc="{inner}"></iframe>', encoding="utf-8")
     command = [str(CHROMIUM), "--headless", "--no-sandbox", "--disable-gpu", "--window-size=1500,1000"]
     command += [f"--user-data-dir={folder}/profile", "--enable-logging=stderr", "--virtual-time-budget=5000"]
@@ -199,6 +201,31 @@ def test_a_browser_runs_the_page_without_an_error(tmp_path: Path, by: str, width
     assert seen["back"] == ("rgb(20, 23, 27)" if dark else "rgb(255, 255, 255)")
     assert seen["cut"] == 0
     assert len(seen["drawn"]) == seen["sliders"] == 3 and min(seen["drawn"]) > 50
+
+
+PULLED = (
+    "<script>addEventListener('load', () => setTimeout(() => { const bar = document.querySelector('.bar');"
+    "const slider = bar.querySelector('input'), canvas = document.querySelector('canvas');"
+    "const pen = canvas.getContext('2d'), shown = pen.fillText.bind(pen); let words = [];"
+    "pen.fillText = (text, ...at) => { words.push(text); shown(text, ...at); };"
+    "const at = value => { words = []; slider.value = value; slider.dispatchEvent(new Event('input')); "
+    "return words; };"
+    "const option = document.querySelector('.option');"
+    "parent.document.title = JSON.stringify({left: at(0), middle: at(50), right: at(100), ends: "
+    "[slider.previousSibling.textContent, slider.nextSibling.textContent], "
+    "wrap: option && getComputedStyle(option).whiteSpace}); }, 500))</script>"
+)
+"""Pulls the first slider to its ends, and tells what is written over the picture."""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium")
+def test_the_ends_of_the_slider_say_what_is_shown_there(tmp_path: Path) -> None:
+    page = report_html(ReportInputs(replace(_result(), reasons=("say --sweep",)), [crowded_street()]))
+    seen, _ = _opened(tmp_path, page, 1400, False, PULLED)
+    assert seen["middle"] == ["before", "after"]
+    assert [seen["left"], seen["right"]] == [["after"], ["before"]]
+    assert seen["ends"] == ["only after", "only before"]
+    assert seen["wrap"] == "nowrap"
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium")
@@ -322,6 +349,29 @@ def test_bars_of_objects_have_names_under_their_numbers(by: str) -> None:
         ">1</text>" in chart
         and ">0.5</text>" not in chart[chart.index(">1</text>") : chart.index("object, ")]
     )
+
+
+@pytest.mark.parametrize("by", PAGES)
+def test_no_arrow_leaves_its_chart(by: str) -> None:
+    (chart,) = re.findall(r"<h3>Over the picture</h3>.*?</figure>", PAGES[by](), re.DOTALL)
+    for drawn in re.findall(r"<svg.*?</svg>", chart, re.DOTALL):
+        box = re.search(r'viewBox="0 0 ([\d.]+) ([\d.]+)"', drawn)
+        arrows = re.search(r'class="arrows a".*?</g>', drawn, re.DOTALL)
+        assert box and arrows
+        tips = np.array(re.findall(r"[ML] ([-\d.]+) ([-\d.]+)", arrows[0]), np.float64)
+        assert len(tips) and tips.min() > 0.0 and (tips < [float(box[1]), float(box[2])]).all()
+
+
+def test_what_is_considered_is_explained() -> None:
+    page = _page()
+    assert "Considered: how far it may be off" in page[page.index("<h3>Assumptions") :]
+
+
+def test_the_parts_of_the_page_are_told() -> None:
+    told: list[tuple[int, int]] = []
+    result = replace(_result(), fit=None)
+    report_html(ReportInputs(result, [crowded_street()]), lambda *steps: told.append(steps))
+    assert told == [(k, len(told)) for k in range(len(told))] and len(told) > 3
 
 
 @pytest.mark.parametrize("by", PAGES)

@@ -35,6 +35,7 @@ from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX, solution_steps
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.covariance.shared_errors import FEWEST
+from sst_graph.drive.stages import begin, run_stage
 from sst_graph.errors import EstimationError
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.known import motion_steps
@@ -42,7 +43,7 @@ from sst_graph.graph.matching import edges_of, match_all
 from sst_graph.graph.outer_loop import JointProblem, support_of
 from sst_graph.graph.state import State, difference, step_text
 from sst_graph.objects.tracks import ObjectId
-from sst_graph.stepwise import Stepwise, run_to_end
+from sst_graph.stepwise import Stepwise
 from sst_graph.types import FloatArray, Guess
 
 MATTERS_SIGMAS = 2.0
@@ -57,6 +58,8 @@ another optimum: wide kernels have led there, past edges that lie closer. Where 
 met (by 1 to 13 %), and two solutions of one optimum differ by less than 0.1 %."""
 
 
+LENS = "lens by edges"
+"""Name of this stage of a calibration."""
 _BESIDE_LABELS = ("cx", "cy")
 """What edges test of it. Outlines of a few vehicles know the principal point to 3 to 9 px, edges of some
 scans to 1 to 5 px. Of focal length and k1 labels know enough, and KITTI's pictures, which are not quite those
@@ -237,6 +240,7 @@ def lens_beside_labels(
         DataError: a frame cannot be read again.
     """
     # 1. Some frames once more, for their edges.
+    begin(problem.progress, LENS)
     offsets_s = [state.time_offset_s(number) for number in range(len(problem.drives))]
     some = problem_of_some_frames(problem.drives, offsets_s, Guess(*state.calibration()), problem.config)
     if some is None:
@@ -246,5 +250,6 @@ def lens_beside_labels(
     clocks = tuple(offsets_s[: len(state.time_offsets_s)])
     held = State(state.cTl, clocks, nuisances=dict(state.nuisances))
     edges = edges_problem(calibration, None, LabelEstimate(held, True))
-    found = run_to_end(lens_steps(edges, held, calibration.objects, problem.config.assumptions, beside))
+    steps = lens_steps(edges, held, calibration.objects, problem.config.assumptions, beside)
+    found = run_stage(steps, problem.progress, LENS)
     return tuple(each for each in found.findings if each.assumption.name in _BESIDE_LABELS)

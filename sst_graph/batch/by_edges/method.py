@@ -11,7 +11,7 @@ import numpy as np
 
 from sst_graph.batch.by_edges.covariance import edges_covariance
 from sst_graph.batch.by_edges.halves import halves_reasons
-from sst_graph.batch.by_edges.lens import lens_steps
+from sst_graph.batch.by_edges.lens import LENS, lens_steps
 from sst_graph.batch.by_edges.optimum import (
     RESTARTS,
     best_optimum_steps,
@@ -33,6 +33,7 @@ from sst_graph.batch.motion_factor import offsets_held_by_motion
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate, MatchedDrives
 from sst_graph.batch.total_covariance import sweep_effects
 from sst_graph.drive.preparation import Drive, Progress
+from sst_graph.drive.stages import begin, run_stage
 from sst_graph.fit import Fit, Profile
 from sst_graph.graph.outer_loop import JointSolution
 from sst_graph.hand_eye.solution import MotionSolution
@@ -63,16 +64,20 @@ def edges_method(
     problem = edges_problem(calibration, motion, labels)
     if labels.state is None:
         # 2. Starts by a search over rotations; the best of them after refinement on a few scans.
-        candidates = run_to_end(refined_steps(problem, run_to_end(starts_steps(problem))))
-        begin, restarts = candidates[0][1].state, RESTARTS
+        starts = run_stage(starts_steps(problem), progress, "search of the start")
+        candidates = run_stage(refined_steps(problem, starts), progress, "search of the start")
+        first, restarts = candidates[0][1].state, RESTARTS
     else:
-        candidates, begin, restarts = [], labels.state, 0
+        candidates, first, restarts = [], labels.state, 0
     # 3. All frames, from the best, and from small turns while one agrees better.
-    solution = run_to_end(best_optimum_steps(problem, begin, restarts, progress))
+    solution = run_to_end(best_optimum_steps(problem, first, restarts, progress))
     # 4. Covariance, with what halves of the objects disagree by, edges that are farther away, and the lens.
     estimate, assumptions = JointEstimate.of(solution, calibration.objects), calibration.config.assumptions
-    lens = run_to_end(lens_steps(problem, solution.state, calibration.objects, assumptions))
-    farther_step, unsettled = run_to_end(farther_edges_steps(problem.whole, solution.state))
+    by_lens = lens_steps(problem, solution.state, calibration.objects, assumptions)
+    lens = run_stage(by_lens, progress, LENS)
+    farther = farther_edges_steps(problem.whole, solution.state)
+    farther_step, unsettled = run_stage(farther, progress, "edges farther away")
+    begin(progress, "covariance")
     own = edges_covariance(problem.whole, estimate, calibration.objects, assumptions, lens.findings)
     covariance = own.matrix + np.outer(farther_step, farther_step)
     sweeps = sweep_effects(calibration, solution, covariance)
@@ -80,6 +85,7 @@ def edges_method(
     lens_reasons, remarks = lens.reasons(covariance), lens.remarks(covariance)
     covariance = covariance + lens.covariance
     # 5. Has it worked?
+    begin(progress, "contrast of the edges")
     contrast = edge_contrast(
         problem.subset_edges, solution.state, [one.state for _, one in candidates], config.seed
     )
@@ -88,12 +94,14 @@ def edges_method(
     reasons = edges_reasons(solution, of_pose, problem.centre)
     reasons += unsettled
     if config.check_contradictions:
+        begin(progress, "contradictions between frames")
         all_points = replace(problem.whole, drives=calibration.drives)
         reasons += halves_reasons(all_points, solution.state, covariance)
     # 6. How it fits the pictures, point by point.
-    first = [one for _, one in candidates[:1]]
+    begin(progress, "fit of the edges")
+    before = [one for _, one in candidates[:1]]
     matched = replace(calibration, drives=problem.whole.drives)
-    fit = fit_of_edges(matched, (*first, solution), covariance)
+    fit = fit_of_edges(matched, (*before, solution), covariance)
     return MethodEstimate(
         cTl=solution.state.cTl,
         time_offset_s=solution.state.time_offsets_s[0],

@@ -14,6 +14,7 @@ from sst_graph.batch.by_edges.problem import EdgesProblem
 from sst_graph.batch.by_edges.reasons import SCORE_WORK, unsettled_reasons
 from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX, WIDER_KERNEL_PX, solution_steps
 from sst_graph.drive.preparation import Progress
+from sst_graph.drive.stages import begin
 from sst_graph.edges.agreement import score
 from sst_graph.edges.search import edge_starts_steps, turned
 from sst_graph.errors import EstimationError
@@ -108,7 +109,7 @@ def best_optimum_steps(
     wide = yield from solution_steps(problem.whole, start, KERNELS_PX, progress)
     best, best_score = yield from _newton_ascent(problem.whole, wide.state, progress)
     for _ in range(restarts):
-        other = yield from _better_nearby(problem, best)
+        other = yield from _better_nearby(problem, best, progress)
         if other is None:
             break
         again, found_score = yield from _newton_ascent(problem.whole, other, progress)
@@ -118,7 +119,9 @@ def best_optimum_steps(
     return (yield from _converged(problem.whole, best, progress))
 
 
-def _better_nearby(problem: EdgesProblem, state: State) -> Stepwise[State | None]:
+def _better_nearby(
+    problem: EdgesProblem, state: State, progress: Progress | None = None
+) -> Stepwise[State | None]:
     """An optimum on a few scans that agrees better than the one at a state; None where none is found."""
     t = state.cTl.translation()
     rotations = turned(state.cTl, np.radians(_TURNS_DEG))
@@ -126,6 +129,7 @@ def _better_nearby(problem: EdgesProblem, state: State) -> Stepwise[State | None
     starts += [*toward_motion(problem, state), *shifted(problem, state)]
     found = []
     for start in starts:
+        begin(progress, "solutions nearby")
         try:
             found.append((yield from _newton_ascent(problem.some, start, None)))
         except EstimationError:

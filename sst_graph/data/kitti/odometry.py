@@ -36,7 +36,7 @@ from sst_graph.data.kitti.odometry_layout import (
     is_kitti,
 )
 from sst_graph.data.kitti.truth import drive_truth
-from sst_graph.data.pictures import PictureFiles, mask_encoding, point_labels
+from sst_graph.data.pictures import PictureFiles, check_scale, mask_encoding, point_labels
 from sst_graph.data.point_times import tells_nothing
 from sst_graph.data.scan_order import rings_from_order
 from sst_graph.data.source import Loader, SourceOptions
@@ -161,7 +161,9 @@ def open_kitti(path: Path, options: SourceOptions) -> KittiSource | TwoClockSour
     counts = FrameCounts(len(stamps_ns), None if image_stamps_ns is None else len(image_stamps_ns))
     files = find_files(folder, options.camera, options.cloud, counts)
     timing = options.timing(stamps_ns)
-    size = picture_size(next(iter(files.images.values())))
+    first = next(iter(files.images.values()))
+    size, P = picture_size(first), calibration.projection(options.camera)
+    check_scale(first, size, files.masks, (float(P[0, 2]), float(P[1, 2])))
     if missing := files.missing():
         _LOG.info("%s: %s", printable(folder), missing)
     truth, is_reference = drive_truth(folder, calibration, options.camera)

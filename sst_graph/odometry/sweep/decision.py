@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
@@ -195,6 +196,7 @@ def decide_sweep(
     count: int,
     stamp: SweepStamp = "forward",
     max_windows: int = MAX_WINDOWS,
+    progress: Callable[[int, int], None] | None = None,
 ) -> SweepDecision:
     """Decide the sweep from the scans of a drive that have no times of their points.
 
@@ -203,8 +205,16 @@ def decide_sweep(
         count: number of positions.
         stamp: the instant that a scan's stamp names, in case the points are as measured.
         max_windows: most that are registered, as long as they may decide.
+        progress: called with (steps done, steps in all); it may be decided before all are done.
     """
-    pairs = _pair_motions(scan_at, count)
+    steps = _SAMPLED_PAIRS + max_windows
+
+    def tell(done: int) -> None:
+        if progress is not None:
+            progress(done, steps)
+
+    tell(0)
+    pairs = _pair_motions(scan_at, count, tell)
     if not pairs:
         return SweepDecision("undecided", SweepTiming(0.0, -np.pi, 0.1, stamp))
     period_s = float(np.median([pair.seconds for pair in pairs]))
@@ -226,7 +236,8 @@ def decide_sweep(
             continue
         windows.append(window)
         used += positions
-        decision = replace(_decide(windows, timing), frames=tuple(sorted(set(used))))
+        now = partial(tell, _SAMPLED_PAIRS + len(windows) - 1)
+        decision = replace(_decide(windows, timing, now), frames=tuple(sorted(set(used))))
         _LOG.info("sweep: %s", decision.sentence)
         if decision.kind != "undecided" or len(windows) == max_windows:
             break
@@ -242,10 +253,13 @@ def _both_senses(timing: SweepTiming) -> tuple[SweepTiming, ...]:
     return tuple(replace(timing, fraction=fraction) for fraction in FRACTIONS.values() if fraction)
 
 
-def _pair_motions(scan_at: Callable[[int], Scan | None], count: int) -> list[_PairMotion]:
-    """Motions at pairs of scans spread over the drive."""
+def _pair_motions(
+    scan_at: Callable[[int], Scan | None], count: int, tell: Callable[[int], None]
+) -> list[_PairMotion]:
+    """Motions at pairs of scans spread over the drive; ``tell`` is given the number of those looked at."""
     found = []
-    for k in evenly_spread(range(max(count - 1, 1)), _SAMPLED_PAIRS):
+    for done, k in enumerate(evenly_spread(range(max(count - 1, 1)), _SAMPLED_PAIRS)):
+        tell(done)
         a, b = scan_at(k), scan_at(k + 1) if k + 1 < count else None
         if a is None or b is None or b.stamp_ns <= a.stamp_ns:
             continue
@@ -303,8 +317,10 @@ def _window_positions(pair: _PairMotion, count: int, every: int) -> list[int]:
     return list(range(first, min(count, first + length + 1), every))
 
 
-def _decide(windows: list[SweepWindow], timing: SweepTiming) -> SweepDecision:
-    """The decision from some windows, which take the poses of the best fit."""
+def _decide(windows: list[SweepWindow], timing: SweepTiming, tell: Callable[[], None]) -> SweepDecision:
+    """The decision from some windows, which take the poses of the best fit; ``tell`` is called before each
+    fit."""
+    tell()
     speed = max(float(np.linalg.norm(window.twists[:, 3:], axis=1).mean()) for window in windows)
     start = 0.0, 0
     turn = max(float(np.linalg.norm(window.twists[:, :3], axis=1).mean()) for window in windows)
@@ -318,7 +334,10 @@ def _decide(windows: list[SweepWindow], timing: SweepTiming) -> SweepDecision:
     decision = _compare_hypotheses(*fits[0], timing)
     if decision.kind != "undecided" or decision.contradiction:
         # Sparse scans meet equally well under several shares, each with matches that confirm it.
-        fits += [_Fit.of(before, (f, 0)) for f in _TRIED if (f, 0) != start]
+        for fraction in _TRIED:
+            if (fraction, 0) != start:
+                tell()
+                fits.append(_Fit.of(before, (fraction, 0)))
         best, *rest = sorted(fits, key=lambda fit: fit.estimate.misfit)
         alike = [best, *(fit for fit in rest if fit.estimate.worse_by(best.estimate) < _SURELY_WORSE)]
         decision = _in_common([_compare_hypotheses(*fit, timing) for fit in alike], timing)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -62,7 +62,9 @@ def timed(scan: Scan, timing: SweepTiming) -> Scan:
     return replace(scan, offsets_s=timing.offsets_s(scan.points))
 
 
-def with_sweep(source: Source, decide: bool = True) -> SweptSource:
+def with_sweep(
+    source: Source, decide: bool = True, progress: Callable[[int, int], None] | None = None
+) -> SweptSource:
     """The source with times for its points, decided from its scans; scans read for that are not read again.
 
     Where its scans have times, nothing is decided, and the source stays as it is. So it does where it was
@@ -71,6 +73,7 @@ def with_sweep(source: Source, decide: bool = True) -> SweptSource:
 
     Args:
         decide: False leaves scans without times as they are, and compares nothing.
+        progress: called with (steps done, steps in all) while it is decided.
 
     Raises:
         DataError: a frame cannot be read.
@@ -95,6 +98,7 @@ def with_sweep(source: Source, decide: bool = True) -> SweptSource:
         len(positions),
         stamp,
         MAX_WINDOWS if turn_s is None else _COMPARED_WINDOWS,
+        progress,
     )
     decision = replace(decision, frames=tuple(positions[k] for k in decision.frames))
     if turn_s is not None:
