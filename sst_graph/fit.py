@@ -70,6 +70,29 @@ class FitQuality:
         return cls(points, share, start, attainable, by_chance)
 
 
+@dataclass(frozen=True)
+class MeasuredFit:
+    """How a calibration fits a drive at its own pose and time offset.
+
+    Attributes:
+        drive: its name.
+        labels: shares by contours of labels; None where the drive has none of its classes in view.
+        edges: shares by edges of the pictures; None without pictures, or objects in view.
+    """
+
+    drive: str
+    labels: FitQuality | None
+    edges: FitQuality | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        parts = {"labels": self.labels, "edges": self.edges}
+        return {
+            "drive": self.drive,
+            **{name: None if one is None else one.to_dict() for name, one in parts.items()},
+        }
+
+
 def _share(value: Any) -> float | None:
     """The number if it is a share, 0 to 1."""
     good = isinstance(value, int | float) and not isinstance(value, bool) and 0.0 <= value <= 1.0

@@ -74,7 +74,7 @@ class ShownFrame:
         Args:
             motion: along the drive, where its frames are drawn in turn; else that of its neighbours is found.
         """
-        time_offset_s, cTl = offset_of(result, drive.source), result.T_camera_lidar
+        time_offset_s, cTl = result.time_offset_of(drive.source.name), result.T_camera_lidar
         if motion is None:
             c_twist = camera_twist(drive, position, cTl)
         else:
@@ -205,9 +205,3 @@ def telling_positions(drive: RecentReader, result: CalibrationResult, count: int
 def _vehicle_points(scan: Scan | None) -> int:
     """Number of vehicle points."""
     return 0 if scan is None else int(np.count_nonzero(scan.classes == int(SemanticClass.VEHICLE)))
-
-
-def offset_of(result: CalibrationResult, source: Source) -> float:
-    """The drive's own offset where the result has one for each drive [s]."""
-    own = {drive.drive: drive.time_offset_s for drive in result.drive_offsets}
-    return own.get(source.name, result.time_offset_s)
