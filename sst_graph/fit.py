@@ -6,6 +6,7 @@ It stays in memory beside the result (:attr:`sst_graph.result.CalibrationResult.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.types import ByValue, Calibration, FloatArray, IntArray
+from sst_graph.types import ByValue, Calibration, FloatArray, IntArray, SemanticClass
 
 CLOSE_PX = 1.5
 """A boundary point closer to its contour than this counts as close [px].
@@ -91,6 +92,14 @@ class MeasuredFit:
             "drive": self.drive,
             **{name: None if one is None else one.to_dict() for name, one in parts.items()},
         }
+
+
+def mask_bias_px(diagnostics: Mapping[str, Any], drive: str, semantic_class: SemanticClass) -> float:
+    """How far masks of a class are drawn too large by a result, in a drive of its own; else 0 [px]."""
+    found = diagnostics.get("mask_bias_px")
+    value = found.get(f"{drive}:{semantic_class.name.lower()}") if isinstance(found, Mapping) else None
+    good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return float(value) if good else 0.0
 
 
 def _share(value: Any) -> float | None:

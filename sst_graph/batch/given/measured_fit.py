@@ -24,7 +24,7 @@ from sst_graph.drive.geometric_labels import GeometricallyLabelled
 from sst_graph.drive.preparation import Progress, check_progress, prepare_drive
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.factors.arguments import described
-from sst_graph.fit import FitQuality, MeasuredFit
+from sst_graph.fit import FitQuality, MeasuredFit, mask_bias_px
 from sst_graph.floating_point import with_usual_errors
 from sst_graph.graph.state import State
 from sst_graph.odometry.sweep import SWEEP_KEY, with_sweep, with_sweep_of
@@ -101,13 +101,7 @@ def _quality(
 
 def _state(result: CalibrationResult, source: Source, config: CalibrationConfig) -> State:
     """The calibration, with the mask biases of the drive and the lens of the result."""
-    found = result.diagnostics.get("mask_bias_px")
-    stored = found if isinstance(found, Mapping) else {}
-    biases = {
-        (0, c): value
-        for c in config.classes
-        if (value := _number(stored.get(f"{source.name}:{c.name.lower()}"))) is not None
-    }
+    biases = {(0, c): mask_bias_px(result.diagnostics, source.name, c) for c in config.classes}
     nuisances = _nuisances(result) if result.camera == source.camera else {}
     return State(result.T_camera_lidar, (result.time_offset_of(source.name),), biases, nuisances=nuisances)
 

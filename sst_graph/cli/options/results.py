@@ -61,7 +61,12 @@ def add_inspect(commands: Commands) -> argparse.ArgumentParser:
 
 def add_overlay(commands: Commands) -> argparse.ArgumentParser:
     text = "draw the LiDAR into the camera image, before and after a calibration"
-    overlay = commands.add_parser("overlay", help=text, description=text)
+    overlay = commands.add_parser(
+        "overlay",
+        help=text,
+        description=f"{text}. The caption has the share of boundary points within 1.5 px of the contour, in "
+        "that frame alone; sst-graph inspect RESULT DATA has that of the drive, and what the labels allow.",
+    )
     overlay.add_argument("result", metavar="RESULT", type=Path, help="calibration.json, or its folder")
     overlay.add_argument("data", metavar="DATA", type=Path, help="drive: dataset or sequence folder")
     add_source_options(overlay)

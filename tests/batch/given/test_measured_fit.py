@@ -53,7 +53,7 @@ def test_of_unlabelled_pictures_and_scans_nothing_is_measured() -> None:
     blind = [
         replace(
             frame,
-            scan=replace(frame.scan, classes=np.zeros_like(frame.scan.classes), instances=None),
+            scan=replace(frame.scan, classes=np.full_like(frame.scan.classes, SemanticClass.IGNORE), instances=None),
             image=replace(
                 frame.image,
                 mask=np.full_like(frame.image.mask, SemanticClass.IGNORE),
