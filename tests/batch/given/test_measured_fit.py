@@ -50,19 +50,14 @@ def test_three_tenths_of_a_degree_show_by_labels_and_by_edges() -> None:
 
 def test_of_unlabelled_pictures_and_scans_nothing_is_measured() -> None:
     street = crowded_street()[:2]
-    blind = [
-        replace(
-            frame,
-            scan=replace(frame.scan, classes=np.full_like(frame.scan.classes, SemanticClass.IGNORE), instances=None),
-            image=replace(
-                frame.image,
-                mask=np.full_like(frame.image.mask, SemanticClass.IGNORE),
-                pixels=np.zeros((0, 0, 3), np.uint8),
-            ),
-        )
-        for frame in street
-        if frame.scan is not None and frame.image is not None
-    ]
+    blind = []
+    for frame in street:
+        scan, image = frame.scan, frame.image
+        assert scan is not None and image is not None
+        unlabelled, unmasked = (np.full_like(a, SemanticClass.IGNORE) for a in (scan.classes, image.mask))
+        nothing_seen = replace(image, mask=unmasked, pixels=np.zeros((0, 0, 3), np.uint8))
+        scan = replace(scan, classes=unlabelled, instances=None)
+        blind.append(replace(frame, scan=scan, image=nothing_seen))
 
     class Blind:
         camera, nominal, name, truth = street.camera, None, "blind", None
