@@ -98,8 +98,9 @@ def mask_bias_px(diagnostics: Mapping[str, Any], drive: str, semantic_class: Sem
     """How far masks of a class are drawn too large by a result, in a drive of its own; else 0 [px]."""
     found = diagnostics.get("mask_bias_px")
     value = found.get(f"{drive}:{semantic_class.name.lower()}") if isinstance(found, Mapping) else None
-    good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    return float(value) if good else 0.0
+    if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
+        return 0.0
+    return float(value)
 
 
 def _share(value: Any) -> float | None:
