@@ -6,6 +6,7 @@ It stays in memory beside the result (:attr:`sst_graph.result.CalibrationResult.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.types import ByValue, Calibration, FloatArray, IntArray
+from sst_graph.types import ByValue, Calibration, FloatArray, IntArray, SemanticClass
 
 CLOSE_PX = 1.5
 """A boundary point closer to its contour than this counts as close [px].
@@ -68,6 +69,38 @@ class FitQuality:
             return None
         start, by_chance = map(_share, optional)
         return cls(points, share, start, attainable, by_chance)
+
+
+@dataclass(frozen=True)
+class MeasuredFit:
+    """How a calibration fits a drive at its own pose and time offset.
+
+    Attributes:
+        drive: its name.
+        labels: shares by contours of labels; None where the drive has none of its classes in view.
+        edges: shares by edges of the pictures; None without pictures, or objects in view.
+    """
+
+    drive: str
+    labels: FitQuality | None
+    edges: FitQuality | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        parts = {"labels": self.labels, "edges": self.edges}
+        return {
+            "drive": self.drive,
+            **{name: None if one is None else one.to_dict() for name, one in parts.items()},
+        }
+
+
+def mask_bias_px(diagnostics: Mapping[str, Any], drive: str, semantic_class: SemanticClass) -> float:
+    """How far masks of a class are drawn too large by a result, in a drive of its own; else 0 [px]."""
+    found = diagnostics.get("mask_bias_px")
+    value = found.get(f"{drive}:{semantic_class.name.lower()}") if isinstance(found, Mapping) else None
+    if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
+        return 0.0
+    return float(value)
 
 
 def _share(value: Any) -> float | None:

@@ -205,6 +205,11 @@ class CalibrationResult:
         """``T_camera_lidar`` and ``time_offset_s`` as one."""
         return Calibration(self.T_camera_lidar, self.time_offset_s)
 
+    def time_offset_of(self, drive: str) -> float:
+        """Time offset of a drive: its own where the result has one for each, else that of all [s]."""
+        own = {one.drive: one.time_offset_s for one in self.drive_offsets}
+        return own.get(drive, self.time_offset_s)
+
     @property
     def image_topic(self) -> str:
         """Topic of the images in a bag; empty where they came from elsewhere."""

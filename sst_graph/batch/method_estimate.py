@@ -31,7 +31,7 @@ from sst_graph.graph.outer_loop import JointSolution
 from sst_graph.graph.state import State
 from sst_graph.odometry.sweep import SWEEP_KEY
 from sst_graph.result import CalibrationResult, DriveOffset, FrameId, Status, WeakDirection
-from sst_graph.types import FloatArray, Guess
+from sst_graph.types import Calibration, FloatArray, Guess
 
 if TYPE_CHECKING:
     from sst_graph.batch.problem import JointOutcome, MatchedDrives
@@ -184,7 +184,8 @@ def result_of(
         wrong += [f"{jump}: {_CALIBRATE_APART}" for jump in jumps if jump not in held]
         remarks += [held[jump] for jump in jumps if jump in held]
     status: Status = "not_converged" if wrong else "unobservable" if estimate.open_sweeps or weak else "ok"
-    qualities = quality_of(estimate.fit) | quality_of(estimate.edges_fit, EDGES_QUALITY)
+    at = Calibration(estimate.cTl, estimate.time_offset_s)
+    qualities = quality_of(estimate.fit, at) | quality_of(estimate.edges_fit, at, EDGES_QUALITY)
     return CalibrationResult(
         T_camera_lidar=estimate.cTl,
         time_offset_s=estimate.time_offset_s,
@@ -206,9 +207,12 @@ def result_of(
     )
 
 
-def quality_of(fit: Fit | None, name: str = QUALITY) -> dict[str, Any]:
-    """The shares of a fit, as an entry of the diagnostics."""
-    return {} if fit is None else {name: fit.quality.to_dict()}
+def quality_of(fit: Fit | None, at: Calibration, name: str = QUALITY) -> dict[str, Any]:
+    """The shares of a fit, and the calibration that they are of, as an entry of the diagnostics."""
+    if fit is None:
+        return {}
+    place = {"T_camera_lidar": at.cTl.matrix().tolist(), "time_offset_s": at.time_offset_s}
+    return {name: {**fit.quality.to_dict(), "at": place}}
 
 
 def _weak_directions(

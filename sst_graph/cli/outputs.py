@@ -84,7 +84,7 @@ def _written(
             name = f"overlay_{plain}_{drive.number(position):06d}.png"
             shown = ShownFrame.of(drive, position, result)
             shown_frames.append(shown.frame)
-            (folder / name).write_bytes(png(overlay(shown, result, placement_before(result, source))))
+            (folder / name).write_bytes(png(overlay(shown, result, placement_before(result, source)).picture))
             if with_report and result.fit is None:  # else the report chooses by the fit
                 frames.append(shown.drawn())
             pictures.append(name)

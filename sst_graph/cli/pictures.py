@@ -17,8 +17,10 @@ from sst_graph.cameras.estimated_camera import EstimatedCamera
 from sst_graph.cli.drive_odometry import DriveOdometry
 from sst_graph.data.frame_parts import RecentReader, image_positions, scan_positions
 from sst_graph.errors import DataError, count_of
-from sst_graph.fit import MatchedFrame
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.fit import MatchedFrame, mask_bias_px
 from sst_graph.odometry.lidar import lidar_odometry
+from sst_graph.quality.frame_share import ClosePoints, close_points
 from sst_graph.report.drawn_frame import DrawnFrame
 from sst_graph.result import CalibrationResult
 from sst_graph.sampling import evenly_spread
@@ -74,7 +76,7 @@ class ShownFrame:
         Args:
             motion: along the drive, where its frames are drawn in turn; else that of its neighbours is found.
         """
-        time_offset_s, cTl = offset_of(result, drive.source), result.T_camera_lidar
+        time_offset_s, cTl = result.time_offset_of(drive.source.name), result.T_camera_lidar
         if motion is None:
             c_twist = camera_twist(drive, position, cTl)
         else:
@@ -96,20 +98,63 @@ class ShownFrame:
         return DrawnFrame(pair, frame.scan, frame.image, self.source.camera)
 
 
-def overlay(shown: ShownFrame, result: CalibrationResult, before: Placement | None) -> NDArray[np.uint8]:
-    """Picture of one frame with the result, below ``before`` where there is one -> (h, w, 3) BGR.
+@dataclass(frozen=True, eq=False)
+class Overlay:
+    """A frame with the LiDAR drawn into it.
+
+    Attributes:
+        picture: (h, w, 3) BGR.
+        after: close points under the result; None of a frame without labels.
+        before: the same under what it is compared with; None without.
+    """
+
+    picture: NDArray[np.uint8]
+    after: ClosePoints | None
+    before: ClosePoints | None
+
+
+def overlay(shown: ShownFrame, result: CalibrationResult, before: Placement | None) -> Overlay:
+    """One frame with the result, below ``before`` where there is one.
 
     Raises:
         DataError: the frame lacks its scan or its image.
     """
     camera, c_twist = shown.source.camera, shown.c_twist
     own = EstimatedCamera.of(result) if result.camera == camera else camera
-    caption = "after (image closest in time)" if shown.other_image else "after"
-    after = draw_overlay(shown.frame, own, result.T_camera_lidar, shown.time_offset_s, c_twist, caption)
+    bias_px = mask_bias_px(result.diagnostics, shown.source.name, SemanticClass.VEHICLE)
+    at = Placement(
+        result.T_camera_lidar,
+        shown.time_offset_s,
+        "after (image closest in time)" if shown.other_image else "after",
+    )
+    close = close_points(shown.frame, own, at, c_twist, bias_px)
+    after = _drawn(shown.frame, own, at, c_twist, close)
     if before is None:
-        return after
-    start = shown.own, camera, before.cTl, before.time_offset_s, c_twist, before.caption
-    return stacked(draw_overlay(*start), after)
+        return Overlay(after, close, None)
+    close_before = close_points(shown.own, camera, before, c_twist, bias_px)
+    above = _drawn(shown.own, camera, before, c_twist, close_before)
+    return Overlay(stacked(above, after), close, close_before)
+
+
+def _drawn(
+    frame: Frame,
+    camera: PinholeCamera,
+    at: Placement,
+    c_twist: FloatArray | None,
+    close: ClosePoints | None,
+) -> NDArray[np.uint8]:
+    """The picture of a placement, its close points in the caption."""
+    caption = at.caption if close is None else f"{at.caption}: {close.words}"
+    return draw_overlay(frame, camera, at.cTl, at.time_offset_s, c_twist, caption)
+
+
+def close_words(after: ClosePoints | None, before: ClosePoints | None) -> str:
+    """Close points of pictures for a line on a terminal; empty without labels."""
+    if after is None:
+        return ""
+    if not after.points or before is None or not before.points:
+        return f"; {after.words}"
+    return f"; {after.words} (before: {100.0 * before.close / before.points:.0f} %)"
 
 
 def png(picture: NDArray[np.uint8]) -> bytes:
@@ -205,9 +250,3 @@ def telling_positions(drive: RecentReader, result: CalibrationResult, count: int
 def _vehicle_points(scan: Scan | None) -> int:
     """Number of vehicle points."""
     return 0 if scan is None else int(np.count_nonzero(scan.classes == int(SemanticClass.VEHICLE)))
-
-
-def offset_of(result: CalibrationResult, source: Source) -> float:
-    """The drive's own offset where the result has one for each drive [s]."""
-    own = {drive.drive: drive.time_offset_s for drive in result.drive_offsets}
-    return own.get(source.name, result.time_offset_s)

@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 from sst_graph.cli.drive_odometry import DriveOdometry
 from sst_graph.cli.output_places import check_apart
 from sst_graph.cli.outputs import placement_before
-from sst_graph.cli.pictures import ShownFrame, overlay
+from sst_graph.cli.pictures import Overlay, ShownFrame, overlay
 from sst_graph.cli.progress import ProgressBar
 from sst_graph.data.frame_parts import RecentReader, scan_positions
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.files import OutputFile, OutputFileKind, output_file
 from sst_graph.odometry.sweep import with_sweep_of
+from sst_graph.quality.frame_share import ClosePoints
 from sst_graph.result import CalibrationResult
 from sst_graph.types import Source
 from sst_graph.viz import Placement
@@ -68,6 +69,21 @@ class VideoOutput:
             write_drive_video(place, self.path, result, drives, progress.stage("video"))
 
 
+@dataclass(frozen=True)
+class WrittenVideo:
+    """What was written.
+
+    Attributes:
+        frames: number of pictures.
+        after: close points of all frames under the result; None without labels.
+        before: the same under what it is compared with; None without.
+    """
+
+    frames: int
+    after: ClosePoints | None
+    before: ClosePoints | None
+
+
 def video_of(path: Path, folder: str) -> Path:
     """The video of one camera of a rig: drive_image_3.mp4 for drive.mp4 and the folder image_3."""
     return path.with_name(f"{path.stem}_{folder}{path.suffix}")
@@ -101,7 +117,7 @@ def write_drive_video(
     result: CalibrationResult,
     drives: Sequence[tuple[Source, Placement | None]],
     progress: Callable[[int, int], None],
-) -> int:
+) -> WrittenVideo:
     """Write every scan of some drives in the image that shows its instant, at the rate of the first drive.
 
     Args:
@@ -110,9 +126,6 @@ def write_drive_video(
         drives: as they are read, each with the placement that the result is compared with.
         progress: called with the scans done and all scans.
 
-    Returns:
-        Number of pictures.
-
     Raises:
         DataError: no scan has an image.
         OSError: the video cannot be written.
@@ -120,29 +133,38 @@ def write_drive_video(
     readers = [(RecentReader(source), before) for source, before in drives]
     total = sum(len(scan_positions(source)) for source, _ in drives)
 
+    after, before_all = [], []
+
     def pictures() -> Iterator[NDArray[np.uint8]]:
         done = 0
         for reader, before in readers:
             motion = DriveOdometry(reader)
             for position in scan_positions(reader.source):
-                picture = _picture(ShownFrame.of(reader, position, result, motion), result, before)
-                if picture is not None:
-                    yield picture
+                drawn = _drawn(ShownFrame.of(reader, position, result, motion), result, before)
+                if drawn is not None:
+                    after.append(drawn.after)
+                    before_all.append(drawn.before)
+                    yield drawn.picture
                 done += 1
                 progress(done, total)
 
     try:
-        return write_video(place, path.suffix.lower(), pictures(), _rate_hz(readers[0][0]))
+        count = write_video(place, path.suffix.lower(), pictures(), _rate_hz(readers[0][0]))
     except OSError as error:
         if error.errno is None:  # ffmpeg's own sentence
             raise OSError(f"{path}: {error}") from error
         raise
+    return WrittenVideo(count, _together(after), _together(before_all))
 
 
-def _picture(
-    shown: ShownFrame, result: CalibrationResult, before: Placement | None
-) -> NDArray[np.uint8] | None:
-    """The picture of a frame; None where it has no scan, or no image is near."""
+def _together(found: Sequence[ClosePoints | None]) -> ClosePoints | None:
+    """Those of all frames; None where no frame has labels."""
+    known = [one for one in found if one is not None]
+    return sum(known, ClosePoints(0, 0)) if known else None
+
+
+def _drawn(shown: ShownFrame, result: CalibrationResult, before: Placement | None) -> Overlay | None:
+    """A frame; None where it has no scan, or no image is near."""
     if None in (shown.frame.scan, shown.frame.image, shown.own.scan, shown.own.image):
         return None
     return overlay(shown, result, before)

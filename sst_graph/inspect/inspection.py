@@ -16,10 +16,13 @@ from sst_graph.covariance.observability import MOTION, SILHOUETTES, Observabilit
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.factors.arguments import described, is_whole
 from sst_graph.files.strict_json import json_able
+from sst_graph.fit import EDGES_QUALITY, FitQuality
+from sst_graph.inspect.changed import change_of
 from sst_graph.inspect.frame_information import KEY, FrameInformation, frames_of
 from sst_graph.inspect.gained import Gained, gained_of
 from sst_graph.inspect.misfit import DEPTHS_M, misfit_at
 from sst_graph.inspect.planning import Plan, limits_of, plan_recording
+from sst_graph.inspect.verdict import fit_line, verdict
 from sst_graph.result import CalibrationResult, Sigmas, WeakDirection
 from sst_graph.types import ByValue, FloatArray
 
@@ -238,12 +241,14 @@ def to_dict(inspection: Inspection) -> dict[str, Any]:
     result = inspection.result
     document: dict[str, Any] = json_able(
         {
+            "verdict": verdict(result),
             "status": result.status,
             "reasons": result.reasons,
             "method": result.method,
             "T_camera_lidar": result.T_camera_lidar,
             "time_offset_s": result.time_offset_s,
             "drive_offsets": result.drive_offsets,
+            "fit": _fit(result),
             "sigmas": {"lidar_axes": inspection.lidar, "camera_axes": inspection.camera},
             "pixels": inspection.pixels,
             "order": NAMES,
@@ -257,6 +262,23 @@ def to_dict(inspection: Inspection) -> dict[str, Any]:
         }
     )
     return document
+
+
+def _fit(result: CalibrationResult) -> dict[str, Any] | None:
+    """What the result holds of its fit to its data; None of one that holds nothing."""
+    stored = FitQuality.from_diagnostics(result.diagnostics)
+    beside = FitQuality.from_diagnostics(result.diagnostics, EDGES_QUALITY)
+    sentence, change = fit_line(result), change_of(result)
+    if not sentence:
+        return None
+    by_edges = stored is not None and stored.by_chance is not None
+    labels, edges = (None, stored) if by_edges else (stored, beside)
+    return {
+        "sentence": sentence,
+        "labels": None if labels is None else labels.to_dict(),
+        "edges": None if edges is None else edges.to_dict(),
+        "changed_since": None if change is None else dataclasses.asdict(change),
+    }
 
 
 def _gained(gained: Gained) -> dict[str, Any]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from textwrap import wrap
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.covariance.observability import worst_ratio
 from sst_graph.errors import count_of
+from sst_graph.fit import MeasuredFit
 from sst_graph.inspect.budget_text import budget_lines
 from sst_graph.inspect.frame_information import FrameInformation
 from sst_graph.inspect.gained_text import MOST_FRAMES, SHORT, gained_lines, short
@@ -23,19 +25,28 @@ from sst_graph.inspect.inspection import (
 from sst_graph.inspect.planning import MOST_FRAMES as MOST_RECORDED
 from sst_graph.inspect.planning import Plan, Prediction, RepeatedView
 from sst_graph.inspect.planning import limits_of as limits_of_result
-from sst_graph.inspect.verdict import fit_line, is_start
+from sst_graph.inspect.verdict import fit_line, is_start, measured_lines, verdict
 from sst_graph.result import CalibrationResult
 from sst_graph.types import FloatArray
 
+_WIDTH = 100
+"""Letters of one line of the verdict."""
 MOST_SENTENCES = 5
 """Correlations that are put into words."""
 _NO_PLAN = ["what to record next: not predicted, for the estimate is not to be trusted (reason above)"]
 
 
-def inspection_text(inspection: Inspection, all_frames: bool = False) -> str:
-    """The whole text, block by block; a dozen frames of the table unless ``all_frames``."""
+def inspection_text(
+    inspection: Inspection, all_frames: bool = False, measured: MeasuredFit | None = None
+) -> str:
+    """The whole text, block by block.
+
+    Args:
+        all_frames: every frame in the table, else a dozen.
+        measured: how the calibration fits a drive, where that was measured.
+    """
     blocks: list[list[str]] = [
-        _head(inspection.result),
+        _head(inspection.result, measured),
         _sigma_block(inspection),
         _correlation_block(inspection),
         _weak_block(inspection),
@@ -151,16 +162,21 @@ def _elsewhere(inspection: Inspection, plan: Plan) -> str | None:
     )
 
 
-def _head(result: CalibrationResult) -> list[str]:
+def _head(result: CalibrationResult, measured: MeasuredFit | None) -> list[str]:
     drives = sorted({frame.drive for frame in result.frames_used})
     count = f"{len(result.frames_used)} frame{'s' * (len(result.frames_used) != 1)}"
+    sentences = wrap(verdict(result), _WIDTH)
     lines = [
+        *(f"{'' if k else 'verdict':<12} {part}" for k, part in enumerate(sentences)),
         f"{'status':<12} {result.status}",
         f"{'method':<12} {result.method}, {count}" + (f" of {', '.join(drives)}" if drives else ""),
     ]
     lines += [f"{'reason':<12} {reason}" for reason in result.reasons]
     if fit := fit_line(result):
         lines.append(f"{'fit':<12} {fit}")
+    if measured is not None:
+        lines.append(f"{'fit now':<12} measured with this calibration on {measured.drive}:")
+        lines += [f"{'':<12} {line}" for line in measured_lines(measured)]
     for drive in result.drive_offsets:
         sigma = short(1e3 * drive.sigma_s)
         lines.append(f"{'offset':<12} {drive.drive}: {1e3 * drive.time_offset_s:+.2f} ms, sigma {sigma} ms")

@@ -9,7 +9,8 @@ import numpy as np
 
 from sst_graph.cameras.estimated_camera import EstimatedCamera
 from sst_graph.errors import count_of
-from sst_graph.fit import CLOSE_PX, EDGES_QUALITY, FitQuality
+from sst_graph.fit import CLOSE_PX, EDGES_QUALITY, FitQuality, MeasuredFit
+from sst_graph.inspect.changed import change_of
 from sst_graph.inspect.misfit import MIDDLE_M, misfit_at
 from sst_graph.inspect.reasons import as_sentence, short_reasons
 from sst_graph.result import CalibrationResult
@@ -17,6 +18,13 @@ from sst_graph.result import CalibrationResult
 CHECK_BY_EDGES = "a check by edges of the pictures, which the estimate has not used"
 RIGHT_OVER_CHANCE = "1.3 to 2"
 """What the share of close edges is under a right calibration, in units of that at random rotations."""
+
+MEASURE = "sst-graph inspect RESULT DATA measures it"
+_FAR_POINTS = 4.0
+"""A share so many percentage points below what labels allow is far below: right calibrations come within two
+or three."""
+_FAR_BELOW = "wrong by a few tenths of a degree or more, or the mount moved"
+_EDGES_TELL_LESS = "no measure by itself: 0.3° takes 3 to 15 points off what a right calibration has"
 
 _FREED = "focal", "k1"
 """Parameters of the lens that a record of ordinary length can determine beside the pose."""
@@ -40,8 +48,15 @@ def is_start(result: CalibrationResult) -> bool:
 def verdict(result: CalibrationResult) -> str:
     """The result in one or two sentences, without terms of the trade.
 
-    Standard deviations of the worst axis; a result that is not ok begins with what is wrong.
+    Standard deviations of the worst axis; a result that is not ok begins with what is wrong, and one whose
+    calibration was changed with that.
     """
+    if (change := change_of(result)) is not None:
+        return f"This is not the calibration that was estimated ({change.words}). Of that: {_verdict(result)}"
+    return _verdict(result)
+
+
+def _verdict(result: CalibrationResult) -> str:
     if result.status == "not_converged":
         first = next(iter(short_reasons(result)), "the estimate contradicts the data")
         return f"Do not use this calibration: {as_sentence(first)}"
@@ -74,7 +89,30 @@ def quality_line(quality: FitQuality, with_attainable: bool = True) -> str:
 
 
 def fit_line(result: CalibrationResult) -> str:
-    """How well the result fits its data, as a line for a terminal: by labels, or by edges; else empty."""
+    """How well the result fits its data, as a line for a terminal: by labels, or by edges; else empty.
+
+    The figures are those of the estimate, and the line says so where the result holds another calibration.
+    """
+    line = _fit_line(result)
+    if line and change_of(result) is not None:
+        return f"of the estimate, not of this calibration ({MEASURE}): {line}"
+    return line
+
+
+def measured_lines(measured: MeasuredFit) -> list[str]:
+    """How well a calibration fits a drive that it was measured on, as lines for a terminal."""
+    lines = []
+    if (labels := measured.labels) is not None:
+        short = 100.0 * (labels.attainable - labels.share)
+        judged = f", {short:.0f} points more: {_FAR_BELOW}" if short >= _FAR_POINTS else ""
+        lines.append(f"labels: {quality_line(labels)}{judged}")
+    if (edges := measured.edges) is not None:
+        lines.append(f"edges: {quality_line(edges)}; {_EDGES_TELL_LESS}")
+    return lines or ["no boundary point has a contour or an edge of the picture nearby"]
+
+
+def _fit_line(result: CalibrationResult) -> str:
+    """The figures in the result."""
     quality = FitQuality.from_diagnostics(result.diagnostics)
     if quality is None:
         return edges_line(result)

@@ -506,7 +506,8 @@ def _camera_result(
         "covariance": own.covariance.tolist(),
         "status": own.status,
     }
-    fit = camera.fit_at(Calibration(cTl, after.time_offsets_s[at]))
+    placed = Calibration(cTl, after.time_offsets_s[at])
+    fit = camera.fit_at(placed)
     diagnostics = {key: value for key, value in own.diagnostics.items() if key != QUALITY}
     return replace(
         own,
@@ -517,6 +518,6 @@ def _camera_result(
         camera_name=name,
         reasons=(*wrong, *kept, *sentences) if cause_first else (*sentences, *kept),
         weak_directions=weak,
-        diagnostics={**diagnostics, **quality_of(fit), "by_own_images": alone},
+        diagnostics={**diagnostics, **quality_of(fit, placed), "by_own_images": alone},
         fit=fit,
     )

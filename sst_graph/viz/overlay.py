@@ -225,12 +225,11 @@ def _at(mask: NDArray[np.uint8], uvs: FloatArray) -> NDArray[np.uint8]:
 
 def _by_class(caption: str, inside: int, outside: int) -> list[tuple[str, Colour]]:
     """The legend of a scan with labels."""
-    total = inside + outside
-    share = f"{100.0 * inside / total:.1f} % of {total}" if total else "none of them"
+    # No share: of all points, it hardly falls where a calibration is a few tenths of a degree off.
     return [
         (caption, (255, 255, 255)),
-        (f"vehicle points in the mask: {share}", IN_MASK),
-        (f"outside: {outside}", OUT_OF_MASK),
+        (f"vehicle points: {inside} in the mask", IN_MASK),
+        (f"{outside} outside", OUT_OF_MASK),
         ("contour", CONTOUR),
         ("not matched", NOT_MATCHED),
     ]

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from sst_graph.cli import main
+from sst_graph.data import open_source
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.inspect.frame_information import KEY, FrameInformation, to_document
 from sst_graph.result import CalibrationResult, DriveOffset, FrameId
@@ -99,6 +100,15 @@ def test_how_the_drives_were_read_is_checked_before_it_is_said(
     assert "The drives were read with --cloud 'a b'." in capsys.readouterr().out
     assert main(["inspect", written(tmp_path, replace(result, read_as={"image_shift": "../x"}))]) == 2
     assert "read_as.image_shift: found '../x', expected a number" in capsys.readouterr().err
+
+
+@pytest.fixture
+def true_result(street: Path) -> CalibrationResult:
+    """Of the street."""
+    source = open_source(street)
+    assert source.truth is not None and source.truth.time_offset_s is not None
+    truth = source.truth
+    return CalibrationResult(truth.cTl, truth.time_offset_s, 1e-6 * np.eye(7), "ok", source.camera)
 
 
 def shown_in(folder: Path) -> set[str]:
@@ -209,3 +219,32 @@ def test_bad_input(
     assert main(["inspect", str(tmp_path), *options]) == 2
     captured = capsys.readouterr()
     assert message in captured.err and captured.err.count("\n") == 1 and captured.out == ""
+
+
+@pytest.mark.slow
+def test_a_calibration_is_measured_on_its_drive(
+    tmp_path: Path, street: Path, true_result: CalibrationResult, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A turn by 0.3 degrees, which the stored figures do not show, does."""
+    turn = gtsam.Pose3.Expmap(np.radians([0.0, 0.3, 0.0, 0.0, 0.0, 0.0]))
+    turned = replace(true_result, T_camera_lidar=true_result.T_camera_lidar.compose(turn))
+    options = [str(street), "--frames", "0:12"]
+    shares = []
+    for one in (true_result, turned):
+        assert main(["inspect", written(tmp_path, one), *options, "--json"]) == 0
+        now = json.loads(capsys.readouterr().out)["fit_now"]
+        assert now["drive"] == open_source(street).name
+        assert now["edges"]["by_chance"] < now["edges"]["share"]
+        shares.append(now["labels"]["attainable"] - now["labels"]["share"])
+    assert shares[0] < 0.04 < 0.08 < shares[1]
+    assert main(["inspect", written(tmp_path, turned), *options]) == 0
+    assert "fit now      measured with this calibration on " in capsys.readouterr().out
+
+
+def test_without_a_drive_nothing_says_how_to_read_one(
+    tmp_path: Path, result: CalibrationResult, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["inspect", written(tmp_path, result), "--image-shift", "1"]) == 2
+    assert "--image-shift: says how DATA is read, expected RESULT DATA" in capsys.readouterr().err
+    assert main(["inspect", written(tmp_path, result), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["fit_now"] is None

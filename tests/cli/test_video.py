@@ -26,7 +26,8 @@ def test_the_video_has_the_picture_of_each_frame(
     command = ["overlay", str(result), str(street), "--frames", f"0:{FRAMES}"]
     video, picture = tmp_path / "drive.mp4", tmp_path / "3.png"
     assert main([*command, "--video", str(video)]) == 0
-    assert f"{FRAMES} frames" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert f"{FRAMES} frames" in said and "within 1.5 px of the contour (before: " in said
     assert main([*command, "--frame", "3", "--out", str(picture)]) == 0
     pictures, rate_hz = read_video(video)
     expected = cv2.imread(str(picture))

@@ -9,7 +9,7 @@ from sst_graph.cli.inputs import given_result
 from sst_graph.cli.messages import mention
 from sst_graph.cli.output_places import PNG_FILE, check_apart
 from sst_graph.cli.outputs import nominal_of, start_of
-from sst_graph.cli.pictures import ShownFrame, overlay, png, position_of
+from sst_graph.cli.pictures import ShownFrame, close_words, overlay, png, position_of
 from sst_graph.cli.progress import ProgressBar
 from sst_graph.cli.reading import open_drive_of
 from sst_graph.cli.video import VIDEO_FILE, write_drive_video
@@ -41,8 +41,10 @@ def run(args: argparse.Namespace) -> int:
         drive = RecentReader(source)
         position = len(drive) // 2 if args.frame is None else position_of(drive, args.frame)
         shown = ShownFrame.of(drive, position, result)
-        out.write_bytes(png(overlay(shown, result, before)))
-    mention(f"wrote {args.out}: frame {drive.number(position)} of {source.name}")
+        drawn = overlay(shown, result, before)
+        out.write_bytes(png(drawn.picture))
+    close = close_words(drawn.after, drawn.before)
+    mention(f"wrote {args.out}: frame {drive.number(position)} of {source.name}{close}")
     return 0
 
 
@@ -56,9 +58,10 @@ def _write_video(args: argparse.Namespace) -> int:
         result, source, before = _read(args)
         with ProgressBar() as progress:
             stage = progress.stage("video")
-            count = write_drive_video(out.partial, args.video, result, [(source, before)], stage)
+            written = write_drive_video(out.partial, args.video, result, [(source, before)], stage)
         out.publish()
-    mention(f"wrote {args.video}: {count_of(count, 'frame')} of {source.name}")
+    close = close_words(written.after, written.before)
+    mention(f"wrote {args.video}: {count_of(written.frames, 'frame')} of {source.name}{close}")
     return 0
 
 

@@ -11,7 +11,6 @@ from sst_graph.batch import CalibrationConfig
 from sst_graph.cli.inputs import chosen_classes, given_result
 from sst_graph.cli.messages import mention
 from sst_graph.cli.output_places import RERUN_FILE, check_apart
-from sst_graph.cli.pictures import offset_of
 from sst_graph.cli.progress import ProgressBar, counted
 from sst_graph.cli.reading import open_drive_of
 from sst_graph.errors import ConfigError, count_of
@@ -49,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _log(recording: Recording, result: CalibrationResult, source: Source) -> int:
     """Log all frames, and the sigmas as frames accumulate; the number of frames shown."""
-    time_offset_s, count = offset_of(result, source), 0
+    time_offset_s, count = result.time_offset_of(source.name), 0
     frames = result.T_camera_lidar, time_offset_s, _classes(result)
     with ProgressBar() as progress:
         shown = counted(source, source, progress.stage("view"))

@@ -32,13 +32,21 @@ def add_evaluate(commands: Commands) -> argparse.ArgumentParser:
 
 
 def add_inspect(commands: Commands) -> argparse.ArgumentParser:
-    text = "how far a result can be trusted: sigmas, correlations, weak directions, what to record next"
+    text = "how far a result can be trusted, what to record next, and how it fits a drive"
     inspect = commands.add_parser(
         "inspect",
         help=text,
         description=f"{text[0].upper()}{text[1:]}; docs/how-to/inspect.md explains each line.",
     )
     inspect.add_argument("result", metavar="RESULT", type=Path, help="calibration.json, or its folder")
+    inspect.add_argument(
+        "data",
+        metavar="DATA",
+        type=Path,
+        nargs="?",
+        help="drive: measure on it how well the calibration in RESULT fits, by labels and by edges of the "
+        "pictures",
+    )
     inspect.add_argument("--all-frames", action="store_true", help="every frame in the table")
     inspect.add_argument(
         "--next", type=int, default=10, metavar="N", help="frames to record next (default %(default)s)"
@@ -46,12 +54,19 @@ def add_inspect(commands: Commands) -> argparse.ArgumentParser:
     inspect.add_argument("--json", action="store_true", help="print JSON (units in the names)")
     inspect.add_argument("--plots", type=Path, metavar="DIR", help="folder for plots as PNG")
     inspect.add_argument("--overwrite", action="store_true", help="replace earlier plots in DIR")
+    add_source_options(inspect)
+    add_label_options(inspect)
     return inspect
 
 
 def add_overlay(commands: Commands) -> argparse.ArgumentParser:
     text = "draw the LiDAR into the camera image, before and after a calibration"
-    overlay = commands.add_parser("overlay", help=text, description=text)
+    overlay = commands.add_parser(
+        "overlay",
+        help=text,
+        description=f"{text}. The caption has the share of boundary points within 1.5 px of the contour, in "
+        "that frame alone; sst-graph inspect RESULT DATA has that of the drive, and what the labels allow.",
+    )
     overlay.add_argument("result", metavar="RESULT", type=Path, help="calibration.json, or its folder")
     overlay.add_argument("data", metavar="DATA", type=Path, help="drive: dataset or sequence folder")
     add_source_options(overlay)

@@ -157,7 +157,7 @@ def test_images_stamped_later_change_the_time_offset_alone(drive: KittiSource, t
     (position,) = telling_positions(reader, from_bag, 1)
     assert position not in source.image_positions
     shown = ShownFrame.of(reader, position, from_bag)
-    assert overlay(shown, from_bag, None).shape[2] == 3
+    assert overlay(shown, from_bag, None).picture.shape[2] == 3
 
 
 def test_without_masks_nothing_is_labelled_and_motion_is_estimated(

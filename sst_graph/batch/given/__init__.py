@@ -1,0 +1,1 @@
+"""A calibration that is given, and a drive that it is to fit."""

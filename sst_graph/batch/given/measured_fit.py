@@ -1,0 +1,128 @@
+"""How a calibration fits a drive at its own pose and time offset: nothing is estimated.
+
+The functions are those that ``calibrate`` measures its estimate with; so a calibration that was written by
+hand, changed, or made of another drive has the same figures.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from sst_graph.assumptions import ASSUMPTIONS
+from sst_graph.batch.by_edges.choice import with_method_for
+from sst_graph.batch.by_edges.problem import with_fewer_points
+from sst_graph.batch.config import CalibrationConfig, prepared_classes
+from sst_graph.batch.problem import CalibrationProblem
+from sst_graph.batch.sources import as_sources
+from sst_graph.config import from_dict
+from sst_graph.drive.geometric_labels import GeometricallyLabelled
+from sst_graph.drive.preparation import Progress, check_progress, prepare_drive
+from sst_graph.errors import ConfigError, DataError
+from sst_graph.factors.arguments import described
+from sst_graph.fit import FitQuality, MeasuredFit, mask_bias_px
+from sst_graph.floating_point import with_usual_errors
+from sst_graph.graph.state import State
+from sst_graph.odometry.sweep import SWEEP_KEY, with_sweep, with_sweep_of
+from sst_graph.result import CalibrationResult
+from sst_graph.types import Guess, SemanticClass, Source
+
+_LOG = logging.getLogger(__name__)
+
+
+@with_usual_errors
+def measure_fit(result: CalibrationResult, source: Source, progress: Progress | None = None) -> MeasuredFit:
+    """How a result fits a drive at its ``T_camera_lidar`` and time offset, by labels and by edges.
+
+    Mask biases and a lens that were estimated with it count as in the result, where the drive is one of its
+    own; else masks count as drawn.
+
+    Args:
+        source: a drive that it was made of, or another one of the same sensors.
+        progress: called with (stage, steps done, steps in all).
+
+    Raises:
+        DataError: no result, no drive, or frames that cannot be used.
+        FactorError: ``progress`` cannot be called so.
+    """
+    check_progress(progress)
+    if not isinstance(result, CalibrationResult):
+        raise DataError("result", described(result), "a CalibrationResult (read_result)")
+    (source,) = as_sources([source])
+    config = settings_of(result)
+    decided = result.diagnostics.get(SWEEP_KEY)
+    if isinstance(decided, Mapping) and source.name in decided:
+        source = with_sweep_of(source, result.diagnostics)
+    else:
+        source = with_sweep(source, config.decide_sweep)
+    labels = None
+    if with_method_for(replace(config, method="auto"), [source]).method != "edges":
+        labels = _quality(result, source, replace(config, method="joint"), progress)
+    edges = _quality(result, source, replace(config, method="edges"), progress)
+    return MeasuredFit(source.name, labels, edges)
+
+
+def settings_of(result: CalibrationResult) -> CalibrationConfig:
+    """The settings that the result was made with; those of a tracker are below ``calibration``.
+
+    Those of a later version, or of none, are the defaults, and that is logged.
+    """
+    own = result.config.get("calibration", result.config)
+    try:
+        config = from_dict(CalibrationConfig, own if isinstance(own, Mapping) else {})
+    except ConfigError as error:
+        _LOG.warning("measured with the default settings, for those of the result cannot be read: %s", error)
+        config = CalibrationConfig()
+    return replace(config, use_motion="never", time_offset_per_drive=False)
+
+
+def _quality(
+    result: CalibrationResult, source: Source, config: CalibrationConfig, progress: Progress | None
+) -> FitQuality | None:
+    """Of labels or of edges, by the method in the settings; None where the drive has none in view."""
+    by_edges = config.method == "edges"
+    # Motion between images is no part of the fit: no features are tracked.
+    prepare = replace(config.prepare, use_visual_odometry=False)
+    seen = GeometricallyLabelled(source) if by_edges else source
+    drive = prepare_drive(seen, prepared_classes(config), prepare, progress, False, not by_edges)
+    below = () if by_edges else _classes(result.diagnostics.get("lower_edges"))
+    config = replace(config, noise=replace(config.noise, lower_edges=below))
+    guess = Guess(result.initial, result.initial_time_offset_s)
+    problem = CalibrationProblem.of([drive], guess, config)
+    if by_edges:
+        problem = with_fewer_points(problem)
+    fit = problem.fit_at(_state(result, source, config))
+    return None if fit is None else fit.quality
+
+
+def _state(result: CalibrationResult, source: Source, config: CalibrationConfig) -> State:
+    """The calibration, with the mask biases of the drive and the lens of the result."""
+    biases = {(0, c): mask_bias_px(result.diagnostics, source.name, c) for c in config.classes}
+    nuisances = _nuisances(result) if result.camera == source.camera else {}
+    return State(result.T_camera_lidar, (result.time_offset_of(source.name),), biases, nuisances=nuisances)
+
+
+def _nuisances(result: CalibrationResult) -> dict[str, float]:
+    """Values of the assumptions' parameters that were estimated with the pose."""
+    found = result.diagnostics.get("estimated")
+    if not isinstance(found, Mapping):
+        return {}
+    entries = {name: found[name] for name in ASSUMPTIONS if isinstance(found.get(name), Mapping)}
+    values = {name: _number(entry.get("value")) for name, entry in entries.items()}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _classes(names: Any) -> tuple[SemanticClass, ...]:
+    """Classes by their names in a result's diagnostics, those that are known."""
+    known = {c.name.lower(): c for c in SemanticClass}
+    return tuple(known[name] for name in names if name in known) if isinstance(names, list) else ()
+
+
+def _number(value: Any) -> float | None:
+    """A finite number in a result's diagnostics, else None."""
+    good = isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
+    return float(value) if good else None
