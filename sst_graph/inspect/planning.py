@@ -126,7 +126,8 @@ def plan_recording(result: CalibrationResult, frames: Sequence[FrameInformation]
     def predicted(proposal: Proposal, number: int = count, search: bool = True) -> Prediction:
         return predict(result.covariance, proposal, number, limits, search, lasting)
 
-    motions = sorted((predicted(p) for p in (*proposals, again)), key=lambda p: (p.worst, -p.bits))
+    # Where the worst is the same, as far as it is shown, what else a motion teaches decides.
+    motions = sorted((predicted(p) for p in (*proposals, again)), key=lambda p: (round(p.worst, 2), -p.bits))
     best = next((name for name in (motion.name for motion in motions) if name in twists), "standing")
     halved = nearer(views.mean(axis=0), result.T_camera_lidar)
     by_view = [
