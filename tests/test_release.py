@@ -77,7 +77,7 @@ def test_a_file_that_is_not_packed_is_named(packed: tuple[Path, Path, Path]) -> 
     forgotten = copy / "sst_graph" / "classes" / "forgotten.csv"
     forgotten.touch()
     try:
-        with pytest.raises(SystemExit, match="differs from the checkout in .*forgotten.csv"):
+        with pytest.raises(SystemExit, match=r"differs from the checkout in .*forgotten\.csv"):
             compare(sdist, wheel, copy)
     finally:
         forgotten.unlink()
