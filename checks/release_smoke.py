@@ -97,6 +97,14 @@ def build(folder: Path) -> Path:
     """The wheel, made from the sdist, both looked into."""
     run([sys.executable, "-m", "build", "--installer", "uv", "--outdir", folder, ROOT])
     (sdist,), (wheel,) = folder.glob("*.tar.gz"), folder.glob("*.whl")
+    compare(sdist, wheel, ROOT)
+    for file in (sdist, wheel):
+        print(f"{file.name}: {file.stat().st_size / 1e6:.1f} MB")
+    return wheel
+
+
+def compare(sdist: Path, wheel: Path, root: Path) -> None:
+    """End the process where the sdist lacks something, or the wheel holds another package than ``root``."""
     with tarfile.open(sdist) as archive:
         held = [name.partition("/")[2] for name in archive.getnames()]
     for wanted in IN_SDIST:
@@ -105,19 +113,14 @@ def build(folder: Path) -> Path:
     with zipfile.ZipFile(wheel) as archive:
         packed = {name for name in archive.namelist() if name.startswith("sst_graph/")}
     expected = {
-        str(path.relative_to(ROOT))
-        for folder_ in (
-            ROOT / "sst_graph",
-            ROOT / "sst_graph" / "factors",
-        )  # a link, which rglob does not follow
-        for path in folder_.rglob("*")
-        if path.is_file() and path.suffix in (".py", ".typed", ".css", ".js")
+        str(path.relative_to(root))
+        # The second is a link, which rglob does not follow.
+        for folder in (root / "sst_graph", root / "sst_graph" / "factors")
+        for path in folder.rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
     }
     if packed != expected:
         raise SystemExit(f"{wheel.name} differs from the checkout in {sorted(packed ^ expected)}")
-    for file in (sdist, wheel):
-        print(f"{file.name}: {file.stat().st_size / 1e6:.1f} MB")
-    return wheel
 
 
 def passes(wheel: Path, python: Path, resolution: str) -> bool:

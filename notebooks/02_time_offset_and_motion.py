@@ -134,7 +134,7 @@ motions = {
     "braking from 8 to 0 m/s": [speed * forward for speed in np.linspace(8, 0, 10)],
     "5 m/s, turning ±15 deg/s": [5 * forward + rate * turn for rate in np.radians(np.linspace(-15, 15, 10))],
 }
-figure, ax = plt.subplots(figsize=(7, 4.2))
+figure, (ax, closer) = plt.subplots(1, 2, figsize=(9, 4.2))
 for name, twists in motions.items():
     rng, information = np.random.default_rng(0), np.zeros((7, 7))
     for twist in twists:
@@ -153,8 +153,10 @@ for name, twists in motions.items():
     print(f"{name}: forward {sigma_cm:.2f} cm, offset {sigma_ms:.2f} ms")
     circle = np.array([np.cos(np.linspace(0, 2 * np.pi, 100)), np.sin(np.linspace(0, 2 * np.pi, 100))])
     ellipse = 2 * np.linalg.cholesky(covariance) @ circle
-    ax.plot(100 * ellipse[0], 1e3 * ellipse[1], label=name)
+    for axes in (ax, closer):
+        axes.plot(100 * ellipse[0], 1e3 * ellipse[1], label=name)
 ax.set(xlabel="error forward [cm]", ylabel="error of the time offset [ms]", title="2 sigma")
+closer.set(xlabel="error forward [cm]", xlim=(-2.0, 2.0), ylim=(-4.0, 4.0), title="enlarged")
 ax.legend()
 figure.tight_layout()
 

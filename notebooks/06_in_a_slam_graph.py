@@ -146,10 +146,11 @@ position = {
 }
 true = np.array([wTl[0].between(pose).translation() for pose in wTl])
 figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4))
-left.plot(*true[:, :2].T, "k-", linewidth=3, alpha=0.3, label="truth")
-for name, found in position.items():
-    left.plot(*found[:, :2].T, ".-", linewidth=0.8, label=name)
-    right.plot(100 * np.linalg.norm(found - true, axis=1), label=name)
+left.plot(*true[:, :2].T, "k-", linewidth=5, alpha=0.2, label="truth")
+# Two of the lines nearly agree: the later one is thin and dashed, so that both show.
+for (name, found), style, width in zip(position.items(), ("-", "-", "k--"), (1.0, 2.5, 1.2), strict=True):
+    left.plot(*found[:, :2].T, style, linewidth=width, label=name)
+    right.plot(100 * np.linalg.norm(found - true, axis=1), style, linewidth=width, label=name)
 left.set(xlabel="forward [m]", ylabel="left [m]", title="from above")
 right.set(xlabel="scan", ylabel="error of the position [cm]")
 left.legend()

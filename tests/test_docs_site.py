@@ -132,6 +132,30 @@ def test_a_page_is_short_enough_to_read(path: Path) -> None:
     assert len(prose.split()) <= 1200
 
 
+def _page(name: str) -> str:
+    return (DOCS / name).read_text(encoding="utf-8")
+
+
+def _found(pattern: str, name: str) -> tuple[str, ...]:
+    """The groups of what a page has once."""
+    (match,) = re.finditer(pattern, _page(name))
+    return match.groups()
+
+
+def test_pages_that_quote_one_run_agree() -> None:
+    """The demo's street in two pages and a picture's words; a real drive's sigma in three places."""
+    first, calibrate = "start/first.md", "start/calibrate.md"
+    (fit,) = _found(r"\nfit +(.+)\n", first)
+    assert f"\n> {fit}\n" in _page("how-to/report.md")
+    verdict = _found(r"verdict +Good to (\S+)° and (\S+) cm", first)
+    assert _found(r"!\[The verdict of the report: good to (\S+) degrees and (\S+) cm\]", first) == verdict
+    for page in (first, calibrate):
+        assert _found(r"time offset is known to (\S+) ms", page) == _found(r" ms \+- (\S+) ms ", page)
+    known = _found(r" ms \+- (\S+) ms ", calibrate)
+    assert _found(r"sigma of the time offset from\s+(\S+) ms to", calibrate) == known
+    assert _found(r"sigma of the time offset is (\S+) ms at shift 1", "results/accuracy.md") == known
+
+
 def test_the_readme_is_short() -> None:
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 120
 

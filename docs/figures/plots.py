@@ -38,8 +38,7 @@ def observability() -> Figure:
                 colour = COLOURS[k] if len(columns) > 1 else COLOURS[3]
                 axes.plot(np.full(len(sigmas), at), sigmas[:, column], ".", color=colour, ms=4, alpha=0.6)
                 axes.plot([at - 0.1, at + 0.1], [np.median(sigmas[:, column])] * 2, color=colour, lw=2.2)
-        axes.axhline(limit, color="#9aa2ab", ls="--", lw=1)
-        axes.text(-0.5, limit, "limit of ok", ha="left", va="bottom", fontsize=7, color="#6b737c")
+        axes.axhline(limit, color="#9aa2ab", ls="--", lw=1, label="limit of ok")
         axes.set_yscale("log")
         axes.set_xticks(range(len(NAMES)), NAMES.values(), fontsize=7)
         axes.set_title(f"σ of {title}" + (" x, y, z" if len(columns) > 1 else "") + f" [{unit}]", fontsize=9)
@@ -50,7 +49,8 @@ def observability() -> Figure:
         axes.set_ylim(low / 1.3, high * 2.5)
     for k, name in enumerate("xyz"):
         panels[0].plot([], [], color=COLOURS[k], lw=2.2, label=f"{name} of the LiDAR")
-    panels[0].legend(fontsize=7, frameon=False, loc="upper right")
+    for axes in panels:
+        axes.legend(fontsize=7, frameon=False, loc="upper right")
     figure.tight_layout()
     return figure
 

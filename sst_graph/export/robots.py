@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from sst_graph.errors import ConfigError
 from sst_graph.export.frames import LINK_AXES, Rig, StaticTransform, filled
 from sst_graph.export.options import CAMERA
 from sst_graph.export.text import hashed, heading, numbers, row, xml_comment, yaml_text
@@ -128,9 +129,12 @@ def autoware(rig: Rig) -> str:
 
     Autoware places the camera *link* (x forward); its optical frame follows from it. Without a tree the LiDAR
     is at the kit's origin.
+
+    Raises:
+        ConfigError: the tree has no frame that can be the kit's.
     """
     options = rig.options
-    kit = options.parent or _KIT
+    kit = options.parent or _kit(rig)
     kitTl = rig.lidar_in(kit if options.tree is not None or options.parent is not None else None, "the kit")
     lines = ["LiDAR-camera calibration by sst-graph"]
     poses = [(options.lidar_frame, kitTl)]
@@ -156,6 +160,20 @@ def autoware(rig: Rig) -> str:
         fields = zip(("x", "y", "z", "roll", "pitch", "yaw"), values, strict=True)
         text += f"  {yaml_text(frame)}:\n" + "".join(f"    {key}: {value}\n" for key, value in fields)
     return text
+
+
+def _kit(rig: Rig) -> str:
+    """Autoware's own name for the kit's frame; of a tree without it, the root above the LiDAR."""
+    tree, lidar = rig.options.tree, rig.options.lidar_frame
+    if tree is None or _KIT in tree.frames:
+        return _KIT
+    rig.check_tree()
+    root = tree.root(lidar)
+    if root == lidar:
+        raise ConfigError(
+            f"--tree: found neither a frame {_KIT!r} nor one above {lidar!r}, expected the kit's, by --parent"
+        )
+    return root
 
 
 def _message(one: StaticTransform) -> str:

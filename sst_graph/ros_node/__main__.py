@@ -1,62 +1,79 @@
-"""The ROS 2 node (docs/how-to/ros-node.md). It takes and publishes bytes; rosbags decodes and encodes."""
+"""The ROS 2 node (docs/how-to/ros-node.md): all that needs rclpy. It takes and publishes bytes."""
 
 from __future__ import annotations
 
+import sys
 from functools import partial
+from typing import Any
 
-from sst_graph.errors import SstGraphError
+from sst_graph.errors import ConfigError, SstGraphError
 from sst_graph.ros_node.calibration_node import CalibrationNode
+from sst_graph.ros_node.startup import read_settings, stopping, with_resolved_topics
+from sst_graph.ros_node.topics import Bridge, Quality, Subscription, message_class
 
 
 def main() -> None:
     """Work until SIGINT or SIGTERM; then use what waits, solve the whole window, and publish that."""
     from rclpy.clock import Clock, ClockType
+    from rclpy.duration import Duration
     from rclpy.executors import SingleThreadedExecutor
 
-    from sst_graph.ros_node.startup import node_of_arguments, read_settings, stopping, with_resolved_topics
-    from sst_graph.ros_node.topics import Publishers, Subscription
-
-    # 1. The node and its core, by the parameters.
+    # 1. The node and its core, by the parameters, which cannot be changed from then on.
     stops = stopping()
     node = node_of_arguments()
-    settings, config = read_settings(node)
+    descriptor = message_class("rcl_interfaces/msg/ParameterDescriptor")
+    fixed = partial(descriptor, read_only=True, dynamic_typing=True)
+    settings, config = read_settings(node, fixed)
     name = node.get_fully_qualified_name().lstrip("/")
     core = CalibrationNode(with_resolved_topics(node, settings), config, name)
     # 2. What is published comes of messages, and of a timer that runs where /clock stands still.
-    publishers = Publishers(node)
-
-    def now_ns() -> int:
-        return int(node.get_clock().now().nanoseconds)
-
-    def take(part: str, data: bytes) -> None:
-        for published in core.add_bytes(part, data, now_ns()):
-            publishers.publish(published)
-
-    def tick() -> None:
-        for one in subscriptions:
-            one.look()
-        publishers.publish(core.tick(now_ns()))
-        if news := core.news():
-            node.get_logger().info(news)
-
-    subscriptions = []
-    for part, record in core.topics.items():
-        topic = getattr(settings, f"{part}_topic", record.topic)
-        subscriptions.append(Subscription(node, part, topic, record, partial(take, part)))
-        subscriptions[-1].listen(settings.queue)
-    node.create_timer(1.0, tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+    bridge = Bridge(node, core)
+    bridge.listen(settings, partial(subscribe, node))
+    node.create_timer(1.0, bridge.tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
     # 3. Work.
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     while not stops:
         executor.spin_once(timeout_sec=0.2)
-    # 4. The end.
-    for published in core.finish(now_ns()):
-        publishers.publish(published)
-    tick()
-    publishers.wait()
+    # 4. The end: at most a second for each topic.
+    bridge.finish(Duration(seconds=1))
     node.destroy_node()
     executor.shutdown()
+
+
+def node_of_arguments() -> Any:
+    """The node, which leaves signals alone.
+
+    Raises:
+        ConfigError: arguments that ROS does not understand, or that are none of ROS.
+    """
+    import rclpy
+    from rclpy.exceptions import NameValidationException
+    from rclpy.signals import SignalHandlerOptions
+    from rclpy.utilities import remove_ros_args
+
+    try:
+        rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
+        node = rclpy.create_node("sst_graph", automatically_declare_parameters_from_overrides=True)
+    except ValueError:
+        raise ConfigError("arguments of ROS: found a parameter that is an empty list") from None
+    except (RuntimeError, NameValidationException) as error:
+        raise ConfigError(f"arguments of ROS: {' '.join(str(error).split())}") from None
+    if others := remove_ros_args(sys.argv)[1:]:
+        raise ConfigError(f"found {' '.join(others)}, expected parameters, --ros-args -p name:=value")
+    return node
+
+
+def subscribe(node: Any, one: Subscription, quality: Quality) -> Any:
+    """A subscription of rclpy to messages as bytes, in that quality of service."""
+    from rclpy.event_handler import SubscriptionEventCallbacks
+    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+    reliability, durability = ReliabilityPolicy[quality.reliability], DurabilityPolicy[quality.durability]
+    profile = QoSProfile(depth=quality.depth, reliability=reliability, durability=durability)
+    events = SubscriptionEventCallbacks(incompatible_qos=one.incompatible, message_lost=one.lost)
+    kind = message_class(one.record.type_name)
+    return node.create_subscription(kind, one.topic, one.taken, profile, event_callbacks=events, raw=True)
 
 
 if __name__ == "__main__":

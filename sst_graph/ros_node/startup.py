@@ -1,10 +1,10 @@
-"""The node by its arguments, its parameters, and the signals that end it; what is in it needs rclpy."""
+"""The node's parameters, and the signals that end it; ``node`` is rclpy's, or has its methods."""
 
 from __future__ import annotations
 
 import dataclasses
 import signal
-import sys
+from collections.abc import Callable
 from typing import Any
 
 from sst_graph.errors import ConfigError
@@ -28,47 +28,21 @@ def stopping() -> list[int]:
     return stops
 
 
-def node_of_arguments() -> Any:
-    """The node, which leaves signals alone.
-
-    Raises:
-        ConfigError: arguments that ROS does not understand, or that are none of ROS.
-    """
-    import rclpy
-    from rclpy.exceptions import NameValidationException
-    from rclpy.signals import SignalHandlerOptions
-    from rclpy.utilities import remove_ros_args
-
-    try:
-        rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
-        node = rclpy.create_node("sst_graph", automatically_declare_parameters_from_overrides=True)
-    except ValueError:
-        raise ConfigError("arguments of ROS: found a parameter that is an empty list") from None
-    except (RuntimeError, NameValidationException) as error:
-        raise ConfigError(f"arguments of ROS: {' '.join(str(error).split())}") from None
-    if others := remove_ros_args(sys.argv)[1:]:
-        raise ConfigError(f"found {' '.join(others)}, expected parameters, --ros-args -p name:=value")
-    return node
-
-
-def read_settings(node: Any) -> tuple[NodeSettings, TrackerConfig]:
-    """Settings of node and tracker by the node's parameters, which cannot be changed from then on.
+def read_settings(node: Any, descriptor: Callable[[], Any]) -> tuple[NodeSettings, TrackerConfig]:
+    """Settings of node and tracker by the node's parameters, each declared anew with a ``descriptor``.
 
     Those of other names are warned of: a file of parameters may be that of several nodes.
 
     Raises:
         ConfigError: a value that cannot be used.
     """
-    from rcl_interfaces.msg import ParameterDescriptor
-
     values = {}
     for name, default in parameter_defaults().items():
         value = default
         if node.has_parameter(name):
             value = node.get_parameter(name).value
             node.undeclare_parameter(name)
-        fixed = ParameterDescriptor(read_only=True, dynamic_typing=True)
-        values[name] = node.declare_parameter(name, value, fixed).value
+        values[name] = node.declare_parameter(name, value, descriptor()).value
     for name in sorted(node.get_parameters_by_prefix("")):
         if name not in values and name not in _OF_ROS and not name.startswith("qos_overrides."):
             node.get_logger().warning(f"parameter {name} is none of this node and is not used")
@@ -81,13 +55,11 @@ def with_resolved_topics(node: Any, settings: NodeSettings) -> NodeSettings:
     Raises:
         ConfigError: a name that no topic can have.
     """
-    from rclpy.exceptions import NameValidationException
-
     given = {name: value for name, value in dataclasses.asdict(settings).items() if name.endswith("_topic")}
     found: dict[str, Any] = {}
     for name, value in given.items():
         try:
             found[name] = node.resolve_topic_name(value) if value else ""
-        except (RuntimeError, ValueError, NameValidationException) as error:
+        except Exception as error:  # rclpy has kinds of its own for names
             raise ConfigError(f"{name}: found {value!r}: {' '.join(str(error).split())}") from None
     return dataclasses.replace(settings, **found)

@@ -273,6 +273,26 @@ def test_autoware_in_a_kit_of_the_vehicle(tmp_path: Path) -> None:
     assert pose == pytest.approx([0.5, 0.1, -0.1, 0.0, 0.0, 0.0], abs=1e-12)
 
 
+def test_autoware_in_a_tree_without_a_parent(tmp_path: Path) -> None:
+    """The kit's frame is Autoware's own where the tree has it, else the root above the LiDAR."""
+    of_root = export_text(turned(3), "autoware", ExportOptions(tree=read_tree(vehicle(tmp_path))))
+    lidar = yaml.safe_load(of_root)["base_link"]["lidar"]
+    assert [lidar[key] for key in ("x", "y", "z")] == pytest.approx(list(BASE_FROM_LIDAR[:3, 3]))
+    named = ExportOptions(parent="base_link", tree=read_tree(vehicle(tmp_path)))
+    assert export_text(turned(3), "autoware", named) == of_root
+    pose = "{translation: {x: 0, y: 0, z: 2}, rotation: {x: 0, y: 0, z: 0, w: 1}}"
+    above = tmp_path / "above.yaml"
+    for parent, child in (("sensor_kit_base_link", "lidar"), ("lidar", "imu_link")):
+        above.write_text(f"header: {{frame_id: {parent}}}\nchild_frame_id: {child}\ntransform: {pose}\n")
+        options = ExportOptions(tree=read_tree(above))
+        if child == "lidar":
+            kit = yaml.safe_load(export_text(turned(3), "autoware", options))["sensor_kit_base_link"]
+            assert kit["lidar"]["z"] == 2.0
+        else:
+            with pytest.raises(ConfigError, match="neither a frame 'sensor_kit_base_link' nor one above"):
+                export_text(turned(3), "autoware", options)
+
+
 def test_the_imu_of_the_vehicle(tmp_path: Path) -> None:
     """MINS: camera and LiDAR both in the IMU; Kalibr: the IMU in the camera."""
     result, options = turned(3), ExportOptions(parent="imu_link", tree=read_tree(vehicle(tmp_path)))
