@@ -11,9 +11,9 @@ from sst_graph.odometry.sweep import REMEDY, SweepDecision
 from sst_graph.types import FloatArray
 
 MATTERS = 1.0
-"""An undecided sweep matters where one of its hypotheses moves an unknown by more than this many of the sigmas
-claimed, which cover all hypotheses by their probability: an improbable one may move it by more. Below, whichever
-is true leaves the result within the sigmas that it states."""
+"""An undecided sweep matters where one of its hypotheses moves an unknown by more than this many of the
+sigmas claimed. They cover all hypotheses by their probability, but an improbable one may move it by more.
+Below, whichever is true leaves the result within the sigmas that it states."""
 
 
 @dataclass(frozen=True)

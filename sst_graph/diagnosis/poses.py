@@ -19,8 +19,6 @@ _SEQUENCES = ("xyz", "zyx", "XYZ", "ZYX", "yxz", "YXZ", "zxy", "ZXY")
 """Orders in which roll, pitch and yaw are applied."""
 _SEARCHED_DEG = 35.0
 """A start nearer than this to the result is good enough for the search [deg]."""
-_FREE_QUALITY = 0.3
-"""Of a pose found among all: more chances agree better than one (foreign images reach 0.2)."""
 _NEAR_DEG, _DESIGN_DEG = 5.0, 15.0
 """A start within this of a wrong conversion is one; a rig's axes are within this of a right angle [deg]."""
 _BASELINE_M, _ALIGNED_DEG, _SIGMAS = (0.25, 1.5), 3.0, 6.0
@@ -33,9 +31,9 @@ def wrong_start(guess: gtsam.Pose3, free: LabelFit | None) -> Finding | None:
     """A start that is turned farther away from where the labels agree than is searched around it.
 
     Args:
-        free: what a search without a start finds.
+        free: what a search without a start finds, again and again.
     """
-    if free is None or free.quality < _FREE_QUALITY:
+    if free is None:
         return None
     turned = quaternion_angle_deg(guess.rotation(), free.cTl.rotation())
     if turned < _SEARCHED_DEG:

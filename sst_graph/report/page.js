@@ -88,8 +88,7 @@ for (const root of document.querySelectorAll(".overlay")) {
     canvas.addEventListener("pointerdown", drag);
     canvas.addEventListener("pointermove", drag);
     root.classList.add("divided");
-    // The handle goes with the divider: at its left end nothing is left of it, so all of the picture is after.
-    bar.append("only after", slider, "only before");
+    bar.append("divider", slider);
   }
   const modes = document.createElement("fieldset"), legend = document.createElement("legend");
   legend.textContent = "colour by"; modes.append(legend);

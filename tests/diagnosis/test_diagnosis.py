@@ -23,6 +23,7 @@ from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.diagnosis import LabelFit, labels, other_camera, preflight
 from sst_graph.diagnosis.cameras import image_size, uncalibrated
+from sst_graph.diagnosis.causes import likely_causes
 from sst_graph.diagnosis.clocks import stamps, two_clocks
 from sst_graph.diagnosis.hypotheses import best_hypothesis
 from sst_graph.diagnosis.labels import searched_classes
@@ -614,11 +615,26 @@ def test_angles_in_the_wrong_unit(degrees: bool, words: str, sequence: str) -> N
     assert found is not None and words in found.cause
 
 
-def test_an_ambiguous_search_reports_no_wrong_start() -> None:
+def test_a_start_is_wrong_where_both_halves_of_the_drive_agree_elsewhere() -> None:
     behind = CTL * gtsam.Pose3(gtsam.Rot3.Rz(np.pi), np.zeros(3))
-    clear, unclear = LabelFit(behind, 0.0, 0.6, 0.8), LabelFit(behind, 0.0, 0.35, 0.6)
-    found = wrong_start(CTL, clear)
-    assert found is not None and "180 deg away" in found.evidence
-    assert wrong_start(CTL, unclear) is None
-    assert wrong_start(CTL, replace(clear, cTl=CTL)) is None
-    assert wrong_start(CTL, None) is None
+    found = LabelFit(behind, 0.0, 0.3, 0.65)
+    aside = replace(found, cTl=behind * gtsam.Pose3(gtsam.Rot3.Rx(np.radians(20.0)), np.zeros(3)))
+    (whole,) = prepare_drives([swept(drive())], NO_SWEEP)
+
+    def cause(first: LabelFit | None, second: LabelFit | None, both: LabelFit | None = found) -> str:
+        def fit(of: Drive, guess: Guess) -> LabelFit | None:
+            if guess.cTl is not None:
+                return None
+            if len(of.scans) == len(whole.scans):
+                return both
+            return first if of.scans[0] is whole.scans[0] else second
+
+        (one,) = likely_causes([whole], Guess(CTL, 0.0), fit)
+        return f"{one.cause}: {one.evidence}"
+
+    assert "the start (Tr) is wrong" in cause(found, found) and "180 deg away" in cause(found, found)
+    for other in ((aside, found), (found, aside), (found, None)):
+        assert "the same scene" in cause(*other)
+    assert "the same scene" in cause(found, found, replace(found, explained=0.2))
+    assert "the same scene" in cause(found, found, None)
+    assert wrong_start(CTL, replace(found, cTl=CTL)) is None and wrong_start(CTL, None) is None
