@@ -156,7 +156,8 @@ for name, twists in motions.items():
     for axes in (ax, closer):
         axes.plot(100 * ellipse[0], 1e3 * ellipse[1], label=name)
 ax.set(xlabel="error forward [cm]", ylabel="error of the time offset [ms]", title="2 sigma")
-closer.set(xlabel="error forward [cm]", xlim=(-2.0, 2.0), ylim=(-4.0, 4.0), title="enlarged")
+closer.set(xlabel="error forward [cm]", ylabel="error of the time offset [ms]", title="enlarged")
+closer.set(xlim=(-2.0, 2.0), ylim=(-4.0, 4.0))
 ax.legend()
 figure.tight_layout()
 

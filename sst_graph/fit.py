@@ -25,6 +25,8 @@ close under the right calibration, and few under one that is 0.3 deg off."""
 MOST_POINTS = 30_000
 """Most boundary points that are kept; with more, every second, third, ... is."""
 
+MASK_BIAS, EDGE_BIAS = "mask_bias_px", "edge_bias_px"
+"""Entries of a result's diagnostics, by drive and class."""
 QUALITY, EDGES_QUALITY = "fit_quality", "fit_quality_of_edges"
 """Entries of a result's diagnostics: of its fit, and of that of the edges where there are labels beside."""
 
@@ -79,28 +81,35 @@ class MeasuredFit:
         drive: its name.
         labels: shares by contours of labels; None where the drive has none of its classes in view.
         edges: shares by edges of the pictures; None without pictures, or objects in view.
+        bias_px: by class, how far its masks are drawn too large [px]; it is taken off.
     """
 
     drive: str
     labels: FitQuality | None
     edges: FitQuality | None
+    bias_px: Mapping[str, float] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able."""
         parts = {"labels": self.labels, "edges": self.edges}
         return {
             "drive": self.drive,
+            "mask_bias_px": dict(self.bias_px),
             **{name: None if one is None else one.to_dict() for name, one in parts.items()},
         }
 
 
-def mask_bias_px(diagnostics: Mapping[str, Any], drive: str, semantic_class: SemanticClass) -> float:
-    """How far masks of a class are drawn too large by a result, in a drive of its own; else 0 [px]."""
-    found = diagnostics.get("mask_bias_px")
-    value = found.get(f"{drive}:{semantic_class.name.lower()}") if isinstance(found, Mapping) else None
-    if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
-        return 0.0
-    return float(value)
+def mask_biases_px(
+    diagnostics: Mapping[str, Any], drive: str, name: str = MASK_BIAS
+) -> dict[SemanticClass, float]:
+    """How far masks of each class are drawn too large by a result, in a drive of its own [px]; empty for
+    another drive. With :data:`EDGE_BIAS`: how far edges of pictures lie outside of the objects."""
+    found, biases = diagnostics.get(name), {}
+    for semantic_class in SemanticClass:
+        value = found.get(f"{drive}:{semantic_class.name.lower()}") if isinstance(found, Mapping) else None
+        if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+            biases[semantic_class] = float(value)
+    return biases
 
 
 def _share(value: Any) -> float | None:

@@ -18,7 +18,7 @@ from sst_graph.cli.drive_odometry import DriveOdometry
 from sst_graph.data.frame_parts import RecentReader, image_positions, scan_positions
 from sst_graph.errors import DataError, count_of
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.fit import MatchedFrame, mask_bias_px
+from sst_graph.fit import MatchedFrame, mask_biases_px
 from sst_graph.odometry.lidar import lidar_odometry
 from sst_graph.quality.frame_share import ClosePoints, close_points
 from sst_graph.report.drawn_frame import DrawnFrame
@@ -121,7 +121,7 @@ def overlay(shown: ShownFrame, result: CalibrationResult, before: Placement | No
     """
     camera, c_twist = shown.source.camera, shown.c_twist
     own = EstimatedCamera.of(result) if result.camera == camera else camera
-    bias_px = mask_bias_px(result.diagnostics, shown.source.name, SemanticClass.VEHICLE)
+    bias_px = mask_biases_px(result.diagnostics, shown.source.name).get(SemanticClass.VEHICLE, 0.0)
     at = Placement(
         result.T_camera_lidar,
         shown.time_offset_s,

@@ -16,6 +16,9 @@ from sst_graph.types import Guess, SemanticClass
 _FREE_QUALITY = 0.15
 """Least quality of a pose found among all, by a drive and by its halves: the KITTI drives have 0.19 and 0.32,
 clouds of another drive 0.48, by chance, and halves that are 18 and 40 deg away from it."""
+_LEAST_HALF, _SHORT_QUALITY = 8, 0.3
+"""Fewest scans in a half that is searched by itself, and the least quality in shorter drives: foreign images
+reach 0.2."""
 
 
 def preflight(drives: Sequence[Drive], guess: Guess, classes: Sequence[SemanticClass]) -> tuple[Finding, ...]:
@@ -60,7 +63,7 @@ def likely_causes(
         return ()
     cause = best_hypothesis(drive, guess, fit, given)
     if cause is None and guess.cTl is not None:
-        cause = wrong_start(guess.cTl, _found_twice(drive, Guess(None, guess.time_offset_s), fit))
+        cause = wrong_start(guess.cTl, _found_by_halves(drive, Guess(None, guess.time_offset_s), fit))
     best = max(0.0 if one is None else one.quality for one in (given, result))
     if cause is None and best < LEAST_QUALITY and any(image.contours for image in drive.images):
         cause = _nothing_in_common(given)
@@ -79,15 +82,16 @@ def mirror(drives: Sequence[Drive], guess: Guess, fit: Fitter, result: LabelFit)
     return () if cause is None else (cause,)
 
 
-def _found_twice(drive: Drive, anywhere: Guess, fit: Fitter) -> LabelFit | None:
+def _found_by_halves(drive: Drive, anywhere: Guess, fit: Fitter) -> LabelFit | None:
     """What a search without a start finds, where either half of the drive finds it by itself.
 
-    Foreign data, too, agree best somewhere, by chance; each half has another such place.
+    Foreign data, too, agree best somewhere, by chance; each half has another such place. Halves of a short
+    drive show too little, and its own agreement has to be better.
     """
     found, middle = fit(drive, anywhere), len(drive.scans) // 2
-    if found is None or found.quality < _FREE_QUALITY:
+    if found is None or found.quality < (_FREE_QUALITY if middle >= _LEAST_HALF else _SHORT_QUALITY):
         return None
-    for half in (range(middle), range(middle, len(drive.scans))):
+    for half in (range(middle), range(middle, len(drive.scans))) if middle >= _LEAST_HALF else ():
         again = fit(drive.part(half), anywhere)
         if again is None or quaternion_angle_deg(again.cTl.rotation(), found.cTl.rotation()) > THERE_DEG:
             return None

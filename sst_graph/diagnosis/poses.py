@@ -31,7 +31,7 @@ def wrong_start(guess: gtsam.Pose3, free: LabelFit | None) -> Finding | None:
     """A start that is turned farther away from where the labels agree than is searched around it.
 
     Args:
-        free: what a search without a start finds, again and again.
+        free: what a search without a start finds, for certain.
     """
     if free is None:
         return None

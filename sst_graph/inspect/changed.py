@@ -16,8 +16,9 @@ from sst_graph.metrics import quaternion_angle_deg
 from sst_graph.result import CalibrationResult
 from sst_graph.types import Calibration
 
-_LEAST_DEG, _LEAST_CM, _LEAST_MS = 1e-3, 1e-2, 1e-2
-"""Smaller changes are those of a file whose numbers were rounded."""
+_LEAST_DEG, _LEAST_CM, _LEAST_MS = 5e-3, 5e-2, 5e-2
+"""Smaller changes are not seen in what is printed, and those of a file whose numbers were rounded to four
+decimals."""
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,8 @@ MEASURE = "sst-graph inspect RESULT DATA measures it"
 _FAR_POINTS = 4.0
 """A share so many percentage points below what labels allow is far below: right calibrations come within two
 or three."""
+_TOLD_BIAS_PX = 0.5
+"""A smaller bias of outlines is not worth a word [px]."""
 _FAR_BELOW = "wrong by a few tenths of a degree or more, or the mount moved"
 _EDGES_TELL_LESS = "no measure by itself: 0.3° takes 3 to 15 points off what a right calibration has"
 
@@ -52,7 +54,8 @@ def verdict(result: CalibrationResult) -> str:
     calibration was changed with that.
     """
     if (change := change_of(result)) is not None:
-        return f"This is not the calibration that was estimated ({change.words}). Of that: {_verdict(result)}"
+        changed = f"This is not the calibration that was estimated ({change.words})."
+        return f"{changed} The estimate itself: {_verdict(result)}"
     return _verdict(result)
 
 
@@ -105,7 +108,9 @@ def measured_lines(measured: MeasuredFit) -> list[str]:
     if (labels := measured.labels) is not None:
         short = 100.0 * (labels.attainable - labels.share)
         judged = f", {short:.0f} points more: {_FAR_BELOW}" if short >= _FAR_POINTS else ""
-        lines.append(f"labels: {quality_line(labels)}{judged}")
+        wide = {name: bias for name, bias in measured.bias_px.items() if abs(bias) >= _TOLD_BIAS_PX}
+        drawn = "".join(f"; outlines of {name} {bias:+.1f} px, taken off" for name, bias in wide.items())
+        lines.append(f"labels: {quality_line(labels)}{judged}{drawn}")
     if (edges := measured.edges) is not None:
         lines.append(f"edges: {quality_line(edges)}; {_EDGES_TELL_LESS}")
     return lines or ["no boundary point has a contour or an edge of the picture nearby"]

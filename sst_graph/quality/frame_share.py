@@ -39,9 +39,9 @@ class ClosePoints:
     def words(self) -> str:
         """For a caption; says so where there is none."""
         if not self.points:
-            return "no boundary point near a contour"
-        share = f"{100.0 * self.close / self.points:.0f} %"
-        return f"{share} of {count_of(self.points, 'boundary point')} within {CLOSE_PX:g} px of the contour"
+            return "no vehicle's boundary near a contour"
+        share, points = f"{100.0 * self.close / self.points:.0f} %", count_of(self.points, "boundary point")
+        return f"{share} of {points} of vehicles within {CLOSE_PX:g} px of the contour"
 
 
 def close_points(
@@ -49,8 +49,7 @@ def close_points(
 ) -> ClosePoints | None:
     """Boundary points of vehicles in a frame and its mask; None where either has no labels.
 
-    As the share of a whole drive, but that objects which move count, too: what a picture draws of them is
-    placed in the same way.
+    The share of a whole drive leaves out objects that move; here they count as if they stood.
 
     Args:
         c_twist: (6,) of the camera at the image [rad/s, m/s]; None: at rest.

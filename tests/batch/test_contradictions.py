@@ -248,6 +248,7 @@ def test_parts_have_the_tracks_of_their_scans() -> None:
     assert support.shape == (6,) and (support > 0.0).all()
 
 
+@pytest.mark.slow
 def test_a_part_without_common_labels_has_no_estimate() -> None:
     drives = prepared()
     blank = replace(drives[0], images=tuple(replace(image, contours={}) for image in drives[0].images))

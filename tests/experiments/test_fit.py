@@ -11,6 +11,7 @@ from sst_graph import CalibrationConfig
 from sst_graph.experiments.fit import FitTableConfig, run
 
 
+@pytest.mark.slow
 def test_a_turned_calibration_has_fewer_close_points() -> None:
     street = replace(CROWDED_STREET, frames=6)
     config = FitTableConfig(seeds=(5000,), label_noises=(1.0,), turn_deg=1.0, street=street)

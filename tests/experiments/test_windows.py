@@ -66,6 +66,7 @@ def test_no_data_and_one_window_are_refused() -> None:
         WindowsConfig(windows=(1,))
 
 
+@pytest.mark.slow
 def test_a_row_for_each_number_of_windows(tmp_path: Path) -> None:
     folder = tmp_path / "street"
     small = SimulationConfig(

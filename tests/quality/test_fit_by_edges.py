@@ -25,6 +25,7 @@ def top(profile: Profile) -> float:
     return float(profile.steps[int(np.argmin(profile.costs))]) / float(SIGMAS[profile.unknown])
 
 
+@pytest.mark.slow
 def test_close_points_stand_out_from_those_of_random_rotations() -> None:
     fit = fit_by_edges()
     quality = fit.quality

@@ -457,6 +457,7 @@ def _yaw_error(
     return float(np.degrees(error)), float(np.degrees(sigma))
 
 
+@pytest.mark.slow
 def test_labels_of_most_objects_that_are_missing_are_no_change(
     street: SimulatedDrive, frames: list[Frame]
 ) -> None:

@@ -56,6 +56,7 @@ def test_quiet_frames_contradict_no_start(street: SimulatedDrive, frames: list[F
     assert updates[7].accepted
 
 
+@pytest.mark.slow
 def test_labels_that_always_contradict_do_not_restart_for_ever(
     street: SimulatedDrive, frames: list[Frame]
 ) -> None:

@@ -36,6 +36,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_from_the_first_frame_to_the_truth(street: SimulatedDrive, frames: list[Frame]) -> None:
     tracker = Tracker(street.camera, EARLY_START, street.nominal)
     updates = [tracker.add(frame) for frame in frames]

@@ -25,7 +25,8 @@ from sst_graph.types import Guess
 ByLabels = Callable[[Sequence[Drive], Guess, CalibrationConfig, Progress | None], MethodEstimate]
 
 _SWEEP_MATTERS = 0.5
-"""A sweep that a part leaves open stays open where it makes up more than this share of a fused sigma."""
+"""A sweep that a part leaves open stays open where it makes up more than this share of a fused sigma: of the
+steps that its hypotheses make, only the covariance is left."""
 _Part = MethodEstimate | str
 """An estimate, or why there is none."""
 _START_SIGMAS = np.array([*np.radians([0.3] * 3), 0.15, 0.15, 0.15, 0.03])

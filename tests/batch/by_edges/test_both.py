@@ -102,6 +102,7 @@ def test_labels_and_edges_are_of_different_pairs() -> None:
     assert len(found[1]) >= 3 and not any(scan % 2 == 0 and image % 2 == 0 for scan, image in found[1])
 
 
+@pytest.mark.slow
 def test_a_whole_drive_goes_one_way() -> None:
     labelled = prepare_drives([with_labels_in(SMALL, 1)], CalibrationConfig(method="both"))
     by_labels, by_edges = split_by_labels(labelled)

@@ -5,15 +5,19 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
+import cv2
 import gtsam
 import numpy as np
 import pytest
 from stored import stored
 from streets import CROWDED_STREET, crowded_street
 
+from sst_graph import CalibrationConfig, calibrate
 from sst_graph.batch.given.measured_fit import measure_fit, settings_of
+from sst_graph.config import with_overrides
+from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.errors import DataError
-from sst_graph.fit import MeasuredFit
+from sst_graph.fit import FitQuality, MeasuredFit
 from sst_graph.inspect.verdict import measured_lines
 from sst_graph.result import CalibrationResult
 from sst_graph.types import SemanticClass
@@ -48,6 +52,38 @@ def test_three_tenths_of_a_degree_show_by_labels_and_by_edges() -> None:
     assert "points more" not in measured_lines(right)[0]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["joint", "edges"])
+def test_what_a_calibration_stored_is_measured_again(method: str) -> None:
+    street = crowded_street()
+    settings = with_overrides(CalibrationConfig(method=method), ["search.enabled=false", "use_motion=never"])
+    result = calibrate(street, street.nominal, settings)
+    kept = FitQuality.from_diagnostics(result.diagnostics)
+    measured = measure_fit(result, crowded_street())
+    again = measured.labels if method == "joint" else measured.edges
+    assert kept is not None and again is not None
+    assert again.share == pytest.approx(kept.share, abs=1e-9 if method == "joint" else 0.003)
+
+
+@pytest.mark.slow
+def test_masks_drawn_too_wide_are_not_taken_for_a_wrong_pose() -> None:
+    frames = []
+    for frame in crowded_street():
+        image = frame.image
+        assert image is not None
+        wide = cv2.dilate((image.mask == SemanticClass.VEHICLE).astype(np.uint8), np.ones((5, 5)))
+        mask = np.where(wide > 0, SemanticClass.VEHICLE, image.mask).astype(image.mask.dtype)
+        frames.append(replace(frame, image=replace(image, mask=mask)))
+    drive = replace(KeptDrive.of(crowded_street()), frames=tuple(frames), name="wide")
+    measured = measure_fit(_true_result(), drive)
+    assert measured.labels is not None
+    assert measured.bias_px["vehicle"] == pytest.approx(_measured(0.0).bias_px["vehicle"] + 2.0, abs=1.0)
+    assert measured.labels.share > measured.labels.attainable - 0.04
+    (line, *_) = measured_lines(measured)
+    assert "outlines of vehicle +" in line and "points more" not in line
+
+
+@pytest.mark.slow
 def test_of_unlabelled_pictures_and_scans_nothing_is_measured() -> None:
     street = crowded_street()[:2]
     blind = []
