@@ -55,7 +55,7 @@ WALL_CLOCK = "seconds"
 """Entry of the diagnostics: how long each stage took [s]; it is not written."""
 
 LIKELY_CAUSES = "likely_causes"
-"""Entry of the diagnostics: those of the reasons that name a likely fault of the data, the others' cause."""
+"""Entry of the diagnostics: the reasons that name a likely fault of the data. Most others follow from it."""
 
 DIRECTION_SCALES: FloatArray = np.array([np.radians(0.1)] * 3 + [0.01] * 3 + [0.001])
 """(7,) one scaled unit of a weak direction: 0.1 deg [rad], 1 cm [m], 1 ms [s]."""

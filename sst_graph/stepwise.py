@@ -7,18 +7,24 @@ frames is the same for the same frames.
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from typing import TypeVar
 
 _T = TypeVar("_T")
 Stepwise = Generator[int, None, _T]
 
 
-def run_to_end(steps: Stepwise[_T]) -> _T:
-    """Do all steps; the result of the computation."""
+def run_to_end(steps: Stepwise[_T], after_step: Callable[[], None] | None = None) -> _T:
+    """Do all steps; the result of the computation.
+
+    Args:
+        after_step: called after each of them.
+    """
     while True:
         try:
             next(steps)
         except StopIteration as stop:
             result: _T = stop.value
             return result
+        if after_step is not None:
+            after_step()

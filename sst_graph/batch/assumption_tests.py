@@ -32,7 +32,7 @@ from sst_graph.covariance.error_model import fit_error_model
 from sst_graph.covariance.image_shifts import columns_by_image, shifts_of
 from sst_graph.covariance.match_table import MatchTable, match_table
 from sst_graph.covariance.observability import weak_directions
-from sst_graph.drive.stages import under
+from sst_graph.drive.stages import stage, under
 from sst_graph.errors import EstimationError
 from sst_graph.graph.building import state_from
 from sst_graph.graph.elimination import Eliminated, Unknowns
@@ -57,6 +57,8 @@ _ANOTHER_OPTIMUM = 0.9
 """Share of the boundary points that the estimate explains below which a solution with all parameters free is
 at another optimum. On twelve streets of two seconds it was 0.94 to 1.02 at the same one, and below 0.3 at
 another on two."""
+_STAGE = "assumptions"
+"""Name of this stage of a calibration."""
 _MOST_AT_LAST_SCALE = 4
 """Most outer iterations at the last scale of :data:`_NEAR_KERNELS_PX` after it, with one parameter free."""
 
@@ -126,7 +128,7 @@ class SolvedProblem:
             replace(free, config=config, centre=centre),
             start,
             kernels_px,
-            under(self.problem.progress, "assumptions"),
+            under(self.problem.progress, _STAGE),
         )
 
 
@@ -147,7 +149,8 @@ def examine_assumptions(
         The tests, the most contradicted first, and what the assumptions add to the covariance.
     """
     config, state = problem.config.assumptions, estimate.solution.state
-    findings = check_assumptions(SolvedProblem(problem, estimate.solution), config)
+    with stage(problem.progress, _STAGE):
+        findings = check_assumptions(SolvedProblem(problem, estimate.solution), config)
     if config.test and not (
         any(finding.contradicted for finding in findings)
         or weak_directions(estimate.covariance[:7, :7], state.cTl, problem.config.observability)

@@ -22,7 +22,7 @@ from sst_graph.batch.by_edges.both import both_method
 from sst_graph.batch.by_edges.choice import with_method_for, with_method_of
 from sst_graph.batch.by_edges.lens import lens_beside_labels
 from sst_graph.batch.by_edges.method import edges_method
-from sst_graph.batch.causes import with_causes
+from sst_graph.batch.causes import CAUSES, with_causes
 from sst_graph.batch.config import CalibrationConfig, Method, prepared_classes
 from sst_graph.batch.contradictions import Contradictions, find_contradictions, offsets_held_by_labels
 from sst_graph.batch.joint_report import (
@@ -41,7 +41,7 @@ from sst_graph.batch.method_estimate import (
 )
 from sst_graph.batch.motion_factor import may_use_motion, with_motion
 from sst_graph.batch.motion_method import motion_method
-from sst_graph.batch.part_solver import PartSolver
+from sst_graph.batch.part_solver import CONTRADICTIONS, PartSolver
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate, JointOutcome, MatchedDrives
 from sst_graph.batch.sources import as_sources
 from sst_graph.batch.total_covariance import total_covariance
@@ -56,7 +56,7 @@ from sst_graph.drive.preparation import (
     check_progress,
     prepare_drive,
 )
-from sst_graph.drive.stages import begin
+from sst_graph.drive.stages import stage
 from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.floating_point import with_usual_errors
 from sst_graph.marginal import MOST_SCAN_HASHES, SCAN_HASHES
@@ -176,7 +176,8 @@ def finished(
     except EstimationError as error:
         result = guess_as_result(drives, guess, config, str(error))
     # Likely faults of the data become the first reasons.
-    result = with_causes(result, drives, guess, config, progress)
+    with stage(progress, CAUSES):
+        result = with_causes(result, drives, guess, config, progress)
     diagnostics = {**result.diagnostics, "seconds": {"estimate": time.perf_counter() - began}}
     left_out = {drive.name: drive.left_out.counts() for drive in drives if drive.left_out.counts()}
     if left_out:
@@ -231,18 +232,20 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
     problem, solutions = replace(problem, config=config), lower.solutions
     # 4. Consistency: drives against each other; stretches of a drive, and both sides of a jump of its stamps.
     parts = PartSolver(problem, solutions[0].state)
-    contradictions, held = find_contradictions(parts), offsets_held_by_labels(parts)
+    with stage(problem.progress, CONTRADICTIONS):
+        contradictions, held = find_contradictions(parts), offsets_held_by_labels(parts)
     # 5. Cluster-robust covariance; motion as a factor where the labels determine all unknowns.
     labels_alone = JointEstimate.of(solutions[0], problem.objects)
     motion = with_motion(problem, labels_alone, contradictions.stretches)
     # 6. Assumptions: tested against the data, considered in the covariance.
     tests, considered = examine_assumptions(problem, motion.estimate, lens_beside_labels)
     # 7. Total covariance: with pictures that shift, unmeasured motion and undecided sweeps.
-    begin(problem.progress, "covariance")
-    total = total_covariance(problem, motion.estimate, considered)
+    with stage(problem.progress, "covariance"):
+        total = total_covariance(problem, motion.estimate, considered)
     # 8. How it fits the labels, point by point.
-    begin(problem.progress, "fit of the labels")
-    fit = fit_of(problem, (start_solution, lower.solutions[0], motion.estimate.solution), total.covariance)
+    solved = (start_solution, lower.solutions[0], motion.estimate.solution)
+    with stage(problem.progress, "fit of the labels"):
+        fit = fit_of(problem, solved, total.covariance)
     # 9. The estimate, and why it may be wrong.
     solution, unknowns = motion.estimate.solution, total.unknowns
     wrong = joint_reasons(problem, solution, solutions, unknowns, agreement)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 
 from sst_graph.assumptions import held_at_zero
 from sst_graph.batch.by_edges.inverted import inverted_start
@@ -24,7 +25,7 @@ from sst_graph.diagnosis import (
     unknown_lasers,
 )
 from sst_graph.drive.preparation import Drive, Progress
-from sst_graph.drive.stages import begin, run_stage, under
+from sst_graph.drive.stages import begin, under
 from sst_graph.errors import EstimationError
 from sst_graph.graph.drive_motion import motions_of
 from sst_graph.graph.outer_loop import (
@@ -39,6 +40,7 @@ from sst_graph.initialization.candidates import StartProblem, prior_centre
 from sst_graph.initialization.selection import select_start_steps
 from sst_graph.result import LIKELY_CAUSES, CalibrationResult
 from sst_graph.sampling import step_for
+from sst_graph.stepwise import run_to_end
 from sst_graph.types import Guess
 
 CAUSES = "likely causes"
@@ -61,7 +63,6 @@ def with_causes(
 ) -> CalibrationResult:
     """The result with what is probably wrong with the data as its first reasons; with any, it is not ok. What
     may be wrong and does not show is a remark."""
-    begin(progress, CAUSES)
     by_labels = config.method not in ("motion", "edges", "both")
     found = preflight(drives, guess, config.classes if by_labels else ())
     causes = [*_wrong_sweeps(drives), *(finding.sentence for finding in found)]
@@ -157,7 +158,7 @@ def fit_labels(config: CalibrationConfig, progress: Progress | None = None) -> F
         search = StartProblem(few, motions, config.classes, guess)
         try:
             steps = select_start_steps(search, joint.graph, config.search, _SCANS, _CANDIDATES)
-            selection = run_stage(steps, progress, CAUSES)
+            selection = run_to_end(steps, partial(begin, progress, CAUSES))
             cTl, found_s = selection.starts[0]
             start = State(cTl, (found_s,))
             problem = JointProblem(few, motions, joint, prior_centre(guess, start))

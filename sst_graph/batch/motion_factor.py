@@ -11,10 +11,11 @@ import numpy as np
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.contradictions import FALSE_ALARM
 from sst_graph.batch.method_estimate import first_after, held_offsets
-from sst_graph.batch.part_solver import PartSolver, SolvedPart
+from sst_graph.batch.part_solver import CONTRADICTIONS, PartSolver, SolvedPart
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.covariance.contradiction import Difference, PartEstimate, name_step
 from sst_graph.drive.preparation import Drive
+from sst_graph.drive.stages import stage
 from sst_graph.drive.stamp_intervals import Jump
 from sst_graph.errors import EstimationError
 from sst_graph.graph.known import KnownCalibration, motion_steps
@@ -110,7 +111,8 @@ def fuse_motion(
         return _left_out(labels, f"the motion was left out: {motion.misfit}", facts)
     if chi2 > MAX_DISAGREEMENT_CHI2 or not motion.converged:
         return WithMotion(labels, _contradiction(step, chi2, motion), facts)
-    worst = _worst_stretch(PartSolver(problem, state), stretches, motion, step)
+    with stage(problem.progress, CONTRADICTIONS):
+        worst = _worst_stretch(PartSolver(problem, state), stretches, motion, step)
     if worst is not None:
         facts["stretch_p_value"] = worst[1].p_value * len(stretches)
         if facts["stretch_p_value"] < FALSE_ALARM:

@@ -20,6 +20,9 @@ from sst_graph.graph.state import State, difference
 from sst_graph.objects.tracks import tracks_of_scans
 from sst_graph.types import FloatArray
 
+CONTRADICTIONS = "contradictions between frames"
+"""Name of the stage of a calibration that solves parts by themselves."""
+
 _MOST_AT_LAST_SCALE = 3
 """Most further outer iterations at the last kernel scale: what is left of a step then is within a sigma."""
 
@@ -120,7 +123,7 @@ class PartSolver:
         drive, motion = self._data(part)
         try:
             problem = JointProblem([drive], [motion], joint, self.reference_of(part))
-            begin(self.problem.progress, "contradictions between frames")
+            begin(self.problem.progress, CONTRADICTIONS)
             solution = solve_joint(problem, start, kernels_px)
             return SolvedPart(part, solution.state, self._step(part, solution))
         except (EstimationError, np.linalg.LinAlgError):

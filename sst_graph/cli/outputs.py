@@ -15,7 +15,7 @@ from sst_graph.cli.progress import ProgressBar
 from sst_graph.data.frame_parts import RecentReader
 from sst_graph.files import OutputKind
 from sst_graph.inspect.inspection import inspect_result, to_dict
-from sst_graph.inspect.reasons import MOST_REASONS, leading_reasons, short_reasons
+from sst_graph.inspect.reasons import first_reason
 from sst_graph.inspect.report import OWN_CALIBRATION, ReferenceErrors, markdown_report
 from sst_graph.inspect.verdict import is_start
 from sst_graph.metrics import calibration_errors
@@ -124,13 +124,7 @@ def exit_code(result: CalibrationResult) -> int:
 
 def why_not_ok(result: CalibrationResult) -> str:
     """Status and first reason of a result that is not ok, in one line."""
-    first, *others = short_reasons(result) or ("the result carries no reason",)
-    if consequences := leading_reasons(result)[1]:
-        return f"{result.status}: {first} ({consequences}; in the report)"
-    in_summary = not loudness.quiet and len(others) < MOST_REASONS
-    where = "in the summary; in full in the report" if in_summary else "in the report"
-    more = f" ({len(others)} more {where})" if others else ""
-    return f"{result.status}: {first}{more}"
+    return f"{result.status}: {first_reason(result, 'the report', summary=not loudness.quiet)}"
 
 
 def placement_before(result: CalibrationResult, source: Source) -> Placement | None:

@@ -14,7 +14,7 @@ from sst_graph.export import common_errors
 from sst_graph.files.json_table import json_table
 from sst_graph.files.reading import parse_json
 from sst_graph.files.strict_json import strict_json
-from sst_graph.inspect.reasons import short_reasons
+from sst_graph.inspect.reasons import first_reason
 from sst_graph.marginal import SCAN_HASHES, CalibrationMarginal, Common, hashes_in, inverse, steps_in
 from sst_graph.result import CalibrationResult
 from sst_graph.types import FloatArray
@@ -205,8 +205,7 @@ def reason_of(result: CalibrationResult) -> str:
     """The first reason of a result that is not ok, in short."""
     if result.status == "ok":
         return ""
-    first, *others = short_reasons(result) or ("the result carries no reason",)
-    return printable(first + (f" ({len(others)} more in its report)" if others else ""), 1000)
+    return printable(first_reason(result, "its report"), 1000)
 
 
 def json_of(data: bytes, place: str | Path, kind: str) -> Any:

@@ -241,7 +241,7 @@ def solve_joint_steps(
             if share * step < step_sigmas:
                 converged = step < OSCILLATION_SIGMAS
                 break
-    if progress is not None:
+    if progress is not None and outer + 1 < config.max_outer:
         progress("solve", config.max_outer, config.max_outer)
     _LOG.info("joint: %d outer iterations, %d pairs", outer + 1, pairs)
     return JointSolution(

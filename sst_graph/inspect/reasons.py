@@ -76,17 +76,42 @@ def short_reasons(result: CalibrationResult) -> tuple[str, ...]:
     return tuple(dict.fromkeys(map(short_reason, result.reasons)))
 
 
+def leading_in_full(result: CalibrationResult) -> tuple[str, ...]:
+    """The likely causes in the data, and then what else stands before the last of them, such as what a rig's
+    cameras contradict; all reasons where no cause is known."""
+    reasons, stored = result.reasons, result.diagnostics.get(LIKELY_CAUSES)
+    causes = [one for one in reasons if one in stored] if isinstance(stored, list) else []
+    if not causes:
+        return reasons
+    last = max(position for position, one in enumerate(reasons) if one in causes)
+    return tuple(dict.fromkeys([*causes, *reasons[:last]]))
+
+
 def leading_reasons(result: CalibrationResult) -> tuple[tuple[str, ...], str]:
     """Short reasons that are shown one by one, and a line about all others, where a likely cause in the data
     is known: it leaves them little to say, and their remedies mislead."""
-    reasons, stored = short_reasons(result), result.diagnostics.get(LIKELY_CAUSES)
-    causes = stored if isinstance(stored, list) else []
-    first = tuple(dict.fromkeys(short_reason(one) for one in result.reasons if one in causes))
-    others = len(reasons) - len(first)
-    if not first or not others:
-        return reasons, ""
-    which = "a consequence of it" if others == 1 else "mostly consequences of it"
-    return first, f"{count_of(others, 'more reason')}, {which}"
+    leading = tuple(dict.fromkeys(map(short_reason, leading_in_full(result))))
+    others = len(short_reasons(result)) - len(leading)
+    if not others:
+        return leading, ""
+    which = "a consequence of" if others == 1 else "mostly consequences of"
+    return leading, f"{count_of(others, 'more reason')}, {which} {'it' if len(leading) == 1 else 'them'}"
+
+
+def first_reason(result: CalibrationResult, report: str, summary: bool = False) -> str:
+    """The first reason, and how many more there are and where, in one line.
+
+    Args:
+        report: what has all of them, such as "the report".
+        summary: whether there is a summary, too, which has the first few.
+    """
+    leading, consequences = leading_reasons(result)
+    first, *others = leading or ("the result carries no reason",)
+    summary = summary and 0 < len(others) < MOST_REASONS
+    counts = [f"{len(others)} more" + " in the summary" * summary] if others else []
+    if consequences:
+        return f"{first} ({' and '.join([*counts, consequences])}; in {report})"
+    return first + "".join(f" ({one}{'; in full' * summary} in {report})" for one in counts)
 
 
 def short_reason(reason: str) -> str:

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from sst_graph.inspect.budget_text import budget_lines, estimated_lines
-from sst_graph.inspect.reasons import MOST_REASONS, leading_reasons
+from sst_graph.inspect.reasons import MOST_REASONS, leading_in_full, leading_reasons
 from sst_graph.inspect.verdict import figure, fit_line, is_start, verdict
 from sst_graph.metrics import (
     CalibrationErrors,
@@ -18,7 +18,7 @@ from sst_graph.metrics import (
     mean_translation_difference_m,
     quaternion_angle_deg,
 )
-from sst_graph.result import LIKELY_CAUSES, CalibrationResult
+from sst_graph.result import CalibrationResult
 
 OFFSET_SIGN = "t_lidar = t_camera_stamp + offset"
 
@@ -108,10 +108,10 @@ def summary_rows(
     rows += [("fit", fit)] if (fit := fit_line(result)) else []
     reasons, others = leading_reasons(result)
     rows += [("reason", reason) for reason in reasons[:MOST_REASONS]]
-    if others:
-        rows.append(("", f"{others}: in the result's file"))
     if len(reasons) > MOST_REASONS:
         rows.append(("", f"and {len(reasons) - MOST_REASONS} more: reasons in the result's file"))
+    if others:
+        rows.append(("", f"{others}: in the result's file"))
     for weak in result.weak_directions:
         if not any(weak.sentence in reason for reason in result.reasons):
             rows += [("weak", weak.sentence), ("", weak.advice)]
@@ -149,8 +149,7 @@ def markdown_report(
         legend: sentences about what is drawn in them.
     """
     _, others = leading_reasons(result)
-    causes = [one for one in result.reasons if one in result.diagnostics.get(LIKELY_CAUSES, ())]
-    said = [*causes, f"{others} (below)"] if others else result.reasons
+    said = [*leading_in_full(result), *([f"{others} (below)"] if others else [])]
     blocks = [
         "# Calibration",
         verdict(result),

@@ -17,14 +17,20 @@ import pytest
 from stored import written
 
 from sst_graph.batch import CalibrationConfig, calibrate
+from sst_graph.batch.calibrate import prepare_drives
+from sst_graph.batch.causes import fit_labels
 from sst_graph.cli import main
 from sst_graph.cli.messages import Loudness, loudness
 from sst_graph.cli.progress import EVERY_S, FIRST_S, ProgressBar, counted
-from sst_graph.drive.stages import begin
+from sst_graph.drive.stages import begin, run_stage, stage, under
+from sst_graph.errors import EstimationError
 from sst_graph.result import read_result
 from sst_graph.simulator import SimulationConfig, simulate
+from sst_graph.stepwise import Stepwise
+from sst_graph.types import Guess
 
 SMALL = ["--frames", "2", "--set", "width=160", "--set", "height=64", "--set", "azimuth_step_deg=2"]
+STREET = SimulationConfig(seed=4, frames=4, width=276, height=84, azimuth_step_deg=0.5, vehicle_density=0.3)
 
 
 @pytest.fixture
@@ -84,14 +90,50 @@ def test_a_stage_of_one_step_has_lines_while_it_goes_on(
 
 @pytest.mark.slow
 def test_the_stages_of_a_calibration_have_names() -> None:
-    street = SimulationConfig(
-        seed=4, frames=4, width=276, height=84, azimuth_step_deg=0.5, vehicle_density=0.3
-    )
     told: list[tuple[str, int, int]] = []
-    calibrate(simulate(street), config=CalibrationConfig(), progress=lambda *step: told.append(step))
-    names = [*dict.fromkeys(stage for stage, _, _ in told)]
-    assert {"search of the start", "solve"} <= {*names} and names[-1] == "likely causes"
+    calibrate(simulate(STREET), config=CalibrationConfig(), progress=lambda *step: told.append(step))
+    assert {"search of the start", "solve"} <= {stage for stage, _, _ in told}
+    assert told[-1] == ("likely causes", 1, 1)
     assert all(0 <= done <= total and total > 0 for _, done, total in told)
+    ends = {name: (done, total) for name, done, total in told}
+    assert all(total == ends[name][1] for name, _, total in told), "one total for each stage"
+    assert all(done == total for done, total in ends.values()), ends
+
+
+@pytest.mark.slow
+def test_a_search_for_causes_is_one_stage() -> None:
+    source, config = simulate(STREET), CalibrationConfig()
+    (drive,) = prepare_drives([source], config)
+    told: list[tuple[str, int, int]] = []
+    fit = fit_labels(config, lambda *step: told.append(step))
+    assert fit(drive, Guess(source.truth.cTl, 0.0)) is not None
+    assert len(told) > 10 and {*told} == {("likely causes", 0, 1)}
+
+
+def test_a_stage_of_steps_ends_once() -> None:
+    def steps() -> Stepwise[str]:
+        yield 1
+        yield 1
+        return "found"
+
+    told: list[tuple[str, int, int]] = []
+
+    def progress(name: str, done: int, total: int) -> None:
+        told.append((name, done, total))
+
+    assert run_stage(steps(), progress, "search") == "found" == run_stage(steps(), None, "search")
+    assert told == [("search", 0, 1)] * 3 + [("search", 1, 1)]
+    told.clear()
+    with stage(progress, "causes"):
+        inside = under(progress, "causes")
+        assert inside is not None and under(None, "causes") is None
+        for done in range(1, 4):
+            inside("solve", done, 3)
+    assert told == [("causes", 0, 1)] * 4 + [("causes", 1, 1)]
+    told.clear()
+    with pytest.raises(EstimationError), stage(progress, "failed"):
+        raise EstimationError("no match")
+    assert told == [("failed", 0, 1)]
 
 
 def test_nothing_is_said_in_a_process_of_others(

@@ -156,8 +156,13 @@ def test_the_page_shows_failures_and_runs_nothing_of_the_data(
 def test_reasons_that_drives_share_are_counted_together(tmp_path: Path) -> None:
     drives = [drive(f"x{k}") for k in range(4)]
     records = {one.name: done(one.name, result(k, "not_converged")) for k, one in enumerate(drives)}
+    more = (
+        "2 more",
+        "3 more reasons, mostly consequences of it;",
+        "1 more and 1 more reason, a consequence of them;",
+    )
     for k, name in enumerate(("x0", "x1", "x2")):
-        words = f"{name}/00: the scans move by {0.5 * k} cm: say how (2 more in its report)"
+        words = f"{name}/00: the scans move by {0.5 * k} cm: say how ({more[k]} in its report)"
         records[name] = replace(records[name], reason=words)
     write_summary(drives, records, Place.of(tmp_path), BatchConfig())
     page = (tmp_path / "summary.html").read_text()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -19,7 +20,9 @@ from sst_graph.cli.outputs import comparison, why_not_ok
 from sst_graph.covariance.observability import MOTION, SILHOUETTES
 from sst_graph.diagnosis.finding import Finding
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.inspect.reasons import MOST_LETTERS, leading_reasons, short_reason
+from sst_graph.fleet.record import reason_of
+from sst_graph.inspect import reasons
+from sst_graph.inspect.reasons import MOST_LETTERS, capitalized, leading_reasons, short_reason
 from sst_graph.inspect.report import markdown_report, summary
 from sst_graph.odometry.sweep import REMEDY
 from sst_graph.report import ReportInputs, report_html
@@ -131,6 +134,32 @@ def test_no_known_reason_is_cut() -> None:
         assert len(short) <= MOST_LETTERS and "…" not in short, short
 
 
+def _texts() -> str:
+    """What the package says, formatted values and parentheses left out, a text a line."""
+    found: list[str] = []
+    for path in Path(sst_graph.__file__).parent.rglob("*.py"):
+        if path == Path(reasons.__file__):
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.JoinedStr):
+                values = (one.value if isinstance(one, ast.Constant) else "0" for one in node.values)
+                found.append("".join(map(str, values)))
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found.append(node.value)
+    return reasons._PARENTHESES.sub("", "\n".join(found))
+
+
+def test_every_phrase_that_is_shortened_is_said() -> None:
+    """Of each pattern its literal parts, in the package's texts or in what a pattern before it makes."""
+    said = _texts()
+    for pattern, shorter in reasons._SHORTER:
+        parts = re.split(r"\\[ds][+*]?|\.\*\??|\[[^]]*\][+*]?|\\w\+|[()|?]", pattern)
+        literal = [part for part in parts if len(part) > 3]
+        assert literal, pattern
+        assert all(part in said for part in literal), pattern
+        said += f"\n{shorter}"
+
+
 def test_the_short_form_keeps_what_and_remedy() -> None:
     lost = short_reason(f"{DRIVE}: {PARTS} {TURNED}; {advice(['offset'])}")
     assert lost == (
@@ -174,6 +203,45 @@ def test_behind_a_known_cause_the_others_are_counted() -> None:
     assert f"{line}." in listed and "record motion" not in listed and "record motion" in in_full
     listed, _, in_full = markdown_report(result, None, []).partition("## All reasons")
     assert line in listed and "record motion" not in listed and f"- {FOLLOWS[1]}" in in_full
+
+
+RIG = "one trigger of all cameras contradicts their time offsets: check whether the cameras are triggered"
+MASKS = "the masks are not those of these pictures: lay a mask over the picture of the same number"
+
+
+def test_what_stands_before_the_last_cause_is_no_consequence_of_it() -> None:
+    """In a rig the contradiction between its cameras does."""
+    cause = "the start is inverted: give T_camera_lidar"
+    result = replace(_result([INVERTED], FOLLOWS[:1]), reasons=(RIG, INVERTED, FOLLOWS[0]))
+    consequence = "1 more reason, a consequence of them"
+    assert leading_reasons(result) == ((cause, RIG), consequence)
+    more = f"1 more in the summary and {consequence}; in the report"
+    assert why_not_ok(result) == f"not_converged: {cause} ({more})"
+    assert reason_of(result) == f"{cause} (1 more and {consequence}; in its report)"
+    shown = summary(result)
+    assert all(one in shown for one in (cause, RIG, consequence)) and FOLLOWS[0] not in shown
+    head, _, in_full = markdown_report(result, None, []).partition("## All reasons")
+    assert f"{INVERTED}; {RIG}; {consequence} (below)" in head and f"- {FOLLOWS[0]}" in in_full
+    listed, _, _ = report_html(ReportInputs(result, [])).partition("The reasons in full")
+    assert all(f"<li>{capitalized(one)}.</li>" in listed for one in (cause, RIG, consequence))
+    assert FOLLOWS[0] not in listed
+
+
+def test_a_second_cause_is_no_consequence_of_the_first() -> None:
+    result = _result([INVERTED, MASKS], [])
+    shown = tuple(map(short_reason, (INVERTED, MASKS)))
+    assert leading_reasons(result) == (shown, "")
+    assert why_not_ok(result) == f"not_converged: {shown[0]} (1 more in the summary; in full in the report)"
+    assert reason_of(result) == f"{shown[0]} (1 more in its report)"
+    others = leading_reasons(_result([INVERTED, MASKS], FOLLOWS))
+    assert others == (shown, "3 more reasons, mostly consequences of them")
+
+
+@pytest.mark.parametrize("stored", [None, 5, "no silhouette matches", {}, [None, 5]])
+def test_stored_causes_that_are_no_list_of_reasons_are_none(stored: object) -> None:
+    result = replace(_result([], FOLLOWS), diagnostics={LIKELY_CAUSES: stored})
+    assert leading_reasons(result) == (tuple(FOLLOWS), "")
+    assert f"Status: **not_converged**: {'; '.join(FOLLOWS)}\n" in markdown_report(result, None, [])
 
 
 def test_a_start_is_not_compared_with_itself() -> None:

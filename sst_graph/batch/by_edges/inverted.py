@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import gtsam
 
-from sst_graph.batch.by_edges.optimum import refined_steps, starts_steps
+from sst_graph.batch.by_edges.optimum import candidate_steps
 from sst_graph.batch.by_edges.problem import LabelEstimate, edges_problem
 from sst_graph.batch.by_edges.reasons import contrast_reasons, edge_contrast
 from sst_graph.batch.config import CalibrationConfig
@@ -38,7 +38,7 @@ def inverted_start(drives: Sequence[Drive], guess: Guess, config: CalibrationCon
     inverse = replace(guess, cTl=cTl)
     try:
         problem = edges_problem(CalibrationProblem.of(drives, inverse, config), None, LabelEstimate())
-        found = run_to_end(refined_steps(problem, run_to_end(starts_steps(problem))))
+        found = run_to_end(candidate_steps(problem))
     except EstimationError:
         return None
     best, *others = [solution.state for _, solution in found]

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -35,7 +36,7 @@ from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX, solution_steps
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.covariance.shared_errors import FEWEST
-from sst_graph.drive.stages import begin, run_stage
+from sst_graph.drive.stages import begin, stage
 from sst_graph.errors import EstimationError
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.known import motion_steps
@@ -43,7 +44,7 @@ from sst_graph.graph.matching import edges_of, match_all
 from sst_graph.graph.outer_loop import JointProblem, support_of
 from sst_graph.graph.state import State, difference, step_text
 from sst_graph.objects.tracks import ObjectId
-from sst_graph.stepwise import Stepwise
+from sst_graph.stepwise import Stepwise, run_to_end
 from sst_graph.types import FloatArray, Guess
 
 MATTERS_SIGMAS = 2.0
@@ -239,17 +240,17 @@ def lens_beside_labels(
     Raises:
         DataError: a frame cannot be read again.
     """
-    # 1. Some frames once more, for their edges.
-    begin(problem.progress, LENS)
-    offsets_s = [state.time_offset_s(number) for number in range(len(problem.drives))]
-    some = problem_of_some_frames(problem.drives, offsets_s, Guess(*state.calibration()), problem.config)
-    if some is None:
-        return ()
-    # 2. The lens by these, from the estimate.
-    calibration, offsets_s = some
-    clocks = tuple(offsets_s[: len(state.time_offsets_s)])
-    held = State(state.cTl, clocks, nuisances=dict(state.nuisances))
-    edges = edges_problem(calibration, None, LabelEstimate(held, True))
-    steps = lens_steps(edges, held, calibration.objects, problem.config.assumptions, beside)
-    found = run_stage(steps, problem.progress, LENS)
-    return tuple(each for each in found.findings if each.assumption.name in _BESIDE_LABELS)
+    with stage(problem.progress, LENS):
+        # 1. Some frames once more, for their edges.
+        offsets_s = [state.time_offset_s(number) for number in range(len(problem.drives))]
+        some = problem_of_some_frames(problem.drives, offsets_s, Guess(*state.calibration()), problem.config)
+        if some is None:
+            return ()
+        # 2. The lens by these, from the estimate.
+        calibration, offsets_s = some
+        clocks = tuple(offsets_s[: len(state.time_offsets_s)])
+        held = State(state.cTl, clocks, nuisances=dict(state.nuisances))
+        edges = edges_problem(calibration, None, LabelEstimate(held, True))
+        steps = lens_steps(edges, held, calibration.objects, problem.config.assumptions, beside)
+        found = run_to_end(steps, partial(begin, problem.progress, LENS))
+        return tuple(each for each in found.findings if each.assumption.name in _BESIDE_LABELS)

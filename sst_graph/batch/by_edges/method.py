@@ -15,9 +15,8 @@ from sst_graph.batch.by_edges.lens import LENS, lens_steps
 from sst_graph.batch.by_edges.optimum import (
     RESTARTS,
     best_optimum_steps,
+    candidate_steps,
     farther_edges_steps,
-    refined_steps,
-    starts_steps,
 )
 from sst_graph.batch.by_edges.problem import LabelEstimate, checking_motion, edges_problem, motion_alone
 from sst_graph.batch.by_edges.reasons import (
@@ -30,10 +29,11 @@ from sst_graph.batch.by_edges.reasons import (
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import MethodEstimate, frames_used
 from sst_graph.batch.motion_factor import offsets_held_by_motion
+from sst_graph.batch.part_solver import CONTRADICTIONS
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate, MatchedDrives
 from sst_graph.batch.total_covariance import sweep_effects
 from sst_graph.drive.preparation import Drive, Progress
-from sst_graph.drive.stages import begin, run_stage
+from sst_graph.drive.stages import run_stage, stage
 from sst_graph.fit import EDGE_BIAS, Fit, Profile
 from sst_graph.graph.outer_loop import JointSolution
 from sst_graph.hand_eye.solution import MotionSolution
@@ -64,8 +64,7 @@ def edges_method(
     problem = edges_problem(calibration, motion, labels)
     if labels.state is None:
         # 2. Starts by a search over rotations; the best of them after refinement on a few scans.
-        starts = run_stage(starts_steps(problem), progress, "search of the start")
-        candidates = run_stage(refined_steps(problem, starts), progress, "search of the start")
+        candidates = run_stage(candidate_steps(problem), progress, "search of the start")
         first, restarts = candidates[0][1].state, RESTARTS
     else:
         candidates, first, restarts = [], labels.state, 0
@@ -77,31 +76,30 @@ def edges_method(
     lens = run_stage(by_lens, progress, LENS)
     farther = farther_edges_steps(problem.whole, solution.state)
     farther_step, unsettled = run_stage(farther, progress, "edges farther away")
-    begin(progress, "covariance")
-    own = edges_covariance(problem.whole, estimate, calibration.objects, assumptions, lens.findings)
-    covariance = own.matrix + np.outer(farther_step, farther_step)
-    sweeps = sweep_effects(calibration, solution, covariance)
+    with stage(progress, "covariance"):
+        own = edges_covariance(problem.whole, estimate, calibration.objects, assumptions, lens.findings)
+        covariance = own.matrix + np.outer(farther_step, farther_step)
+        sweeps = sweep_effects(calibration, solution, covariance)
     covariance = covariance + sweeps.covariance
     lens_reasons, remarks = lens.reasons(covariance), lens.remarks(covariance)
     covariance = covariance + lens.covariance
     # 5. Has it worked?
-    begin(progress, "contrast of the edges")
-    contrast = edge_contrast(
-        problem.subset_edges, solution.state, [one.state for _, one in candidates], config.seed
-    )
+    others = [one.state for _, one in candidates]
+    with stage(progress, "contrast of the edges"):
+        contrast = edge_contrast(problem.subset_edges, solution.state, others, config.seed)
     checking = checking_motion(motion, config)
     of_pose = pose_reasons(solution.state, contrast, checking, covariance)
     reasons = edges_reasons(solution, of_pose, problem.centre)
     reasons += unsettled
     if config.check_contradictions:
-        begin(progress, "contradictions between frames")
         all_points = replace(problem.whole, drives=calibration.drives)
-        reasons += halves_reasons(all_points, solution.state, covariance)
+        with stage(progress, CONTRADICTIONS):
+            reasons += halves_reasons(all_points, solution.state, covariance)
     # 6. How it fits the pictures, point by point.
-    begin(progress, "fit of the edges")
     before = [one for _, one in candidates[:1]]
     matched = replace(calibration, drives=problem.whole.drives)
-    fit = fit_of_edges(matched, (*before, solution), covariance)
+    with stage(progress, "fit of the edges"):
+        fit = fit_of_edges(matched, (*before, solution), covariance)
     return MethodEstimate(
         cTl=solution.state.cTl,
         time_offset_s=solution.state.time_offsets_s[0],

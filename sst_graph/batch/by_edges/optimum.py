@@ -14,7 +14,7 @@ from sst_graph.batch.by_edges.problem import EdgesProblem
 from sst_graph.batch.by_edges.reasons import SCORE_WORK, unsettled_reasons
 from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX, WIDER_KERNEL_PX, solution_steps
 from sst_graph.drive.preparation import Progress
-from sst_graph.drive.stages import begin
+from sst_graph.drive.stages import begin, stage
 from sst_graph.edges.agreement import score
 from sst_graph.edges.search import edge_starts_steps, turned
 from sst_graph.errors import EstimationError
@@ -55,6 +55,8 @@ _BETTER = 1.005
 """Its score is higher by this factor: smaller differences are those of one optimum reached twice."""
 _GAIN = 1.001
 """A round that raises the score by less than this factor is the last, where only scores are compared."""
+_NEARBY = "solutions nearby"
+"""Name of a stage of a calibration."""
 _MAX_ROUNDS = 10
 """Most times that the near scales are gone through."""
 CONVERGED_STEP = np.array([*np.radians([0.02] * 3), 0.005, 0.005, 0.005, 0.003])
@@ -74,6 +76,16 @@ def starts_steps(problem: EdgesProblem) -> Stepwise[list[State]]:
     if not found:
         raise EstimationError("no LiDAR edge in any picture")
     return found
+
+
+def candidate_steps(problem: EdgesProblem) -> Stepwise[list[tuple[float, JointSolution]]]:
+    """Solutions on a few scans from the starts of the search, by their score, best first.
+
+    Raises:
+        EstimationError: no start, or none leads anywhere.
+    """
+    starts = yield from starts_steps(problem)
+    return (yield from refined_steps(problem, starts))
 
 
 def refined_steps(
@@ -128,13 +140,14 @@ def _better_nearby(
     starts = [state, *(replace(state, cTl=gtsam.Pose3(gtsam.Rot3.ClosestTo(R), t)) for R in rotations)]
     starts += [*toward_motion(problem, state), *shifted(problem, state)]
     found = []
-    for start in starts:
-        begin(progress, "solutions nearby")
-        try:
-            found.append((yield from _newton_ascent(problem.some, start, None)))
-        except EstimationError:
-            if start is state:
-                return None
+    with stage(progress, _NEARBY):
+        for start in starts:
+            try:
+                found.append((yield from _newton_ascent(problem.some, start, None)))
+            except EstimationError:
+                if start is state:
+                    return None
+            begin(progress, _NEARBY)
     (_, own), *others = found
     other, found_score = max(others, key=lambda one: one[1], default=(state, 0.0))
     return other if found_score >= _BETTER * own else None

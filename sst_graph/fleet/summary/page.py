@@ -130,7 +130,7 @@ def _kind_of(row: Row) -> str:
 
 
 _LONGEST_KIND = 160
-_MORE, _NUMBER = re.compile(r" \(\d+ more in its report\)$"), re.compile(r"\d+(?:\.\d+)?")
+_MORE, _NUMBER = re.compile(r" \(\d+ more [^()]*in its report\)$"), re.compile(r"\d+(?:\.\d+)?")
 
 
 def _vehicles(rows: Sequence[Row]) -> str:
