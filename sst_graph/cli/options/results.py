@@ -65,7 +65,7 @@ def add_overlay(commands: Commands) -> argparse.ArgumentParser:
         "overlay",
         help=text,
         description=f"{text}. The caption has the share of vehicles' boundary points within 1.5 px of the "
-        "contour, in that frame alone; sst-graph inspect RESULT DATA has that of the drive, and what the labels "
+        "contour, in that frame alone; sst-graph inspect RESULT DATA has that of the drive, and what labels "
         "allow.",
     )
     overlay.add_argument("result", metavar="RESULT", type=Path, help="calibration.json, or its folder")
