@@ -12,7 +12,7 @@ from sst_graph.errors import count_of
 from sst_graph.fit import CLOSE_PX, EDGES_QUALITY, FitQuality, MeasuredFit
 from sst_graph.inspect.changed import change_of
 from sst_graph.inspect.misfit import MIDDLE_M, misfit_at
-from sst_graph.inspect.reasons import as_sentence, short_reasons
+from sst_graph.inspect.reasons import as_sentence, leading_reasons
 from sst_graph.result import CalibrationResult
 
 CHECK_BY_EDGES = "a check by edges of the pictures, which the estimate has not used"
@@ -61,13 +61,13 @@ def verdict(result: CalibrationResult) -> str:
 
 def _verdict(result: CalibrationResult) -> str:
     if result.status == "not_converged":
-        first = next(iter(short_reasons(result)), "the estimate contradicts the data")
+        first = next(iter(leading_reasons(result)[0]), "the estimate contradicts the data")
         return f"Do not use this calibration: {as_sentence(first)}"
     if is_start(result):
-        first = next(iter(short_reasons(result)), "no frame could be used")
+        first = next(iter(leading_reasons(result)[0]), "no frame could be used")
         return f"No estimate: {as_sentence(first)} What stands in this result is the start."
     if result.status == "unobservable":
-        first = next(iter(short_reasons(result)), "the data leave a direction open")
+        first = next(iter(leading_reasons(result)[0]), "the data leave a direction open")
         return f"Not finished: {as_sentence(first)} As it is: {_known(result)}"
     return f"Good to {_known(result)}"
 
