@@ -73,8 +73,8 @@ def test_without_labels_there_is_no_share() -> None:
 
 def test_words() -> None:
     after, before = ClosePoints(57, 96) + ClosePoints(0, 4), ClosePoints(39, 100)
-    assert after.words == "57 % of 100 boundary points within 1.5 px of the contour"
-    assert ClosePoints(0, 0).words == "no boundary point near a contour"
+    assert after.words == "57 % of 100 boundary points of vehicles within 1.5 px of the contour"
+    assert ClosePoints(0, 0).words == "no vehicle's boundary near a contour"
     assert close_words(after, before) == f"; {after.words} (before: 39 %)"
     assert close_words(after, None) == close_words(after, ClosePoints(0, 0)) == f"; {after.words}"
     assert close_words(None, None) == ""
