@@ -287,6 +287,7 @@ def labels_and_stretch(drive: Drive) -> tuple[PartSolver, JointEstimate, SolvedP
     return parts, labels, SolvedPart(Part(0, (4, 5, 6, 7)), state, PartEstimate(away, np.diag(SIGMAS**2)))
 
 
+@pytest.mark.slow
 def test_motion_that_contradicts_a_stretch_is_left_out() -> None:
     (drive,) = prepared()
     parts, labels, differs = labels_and_stretch(turned_scans(drive, range(4, 8), TURN_DEG))

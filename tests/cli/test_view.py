@@ -76,6 +76,7 @@ def test_without_the_extra_the_message_names_it(
     assert done.stderr.count("\n") == 1 and "pip install 'sst-graph[rerun]'" in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("most_bytes", [3000, 60_000])
 @pytest.mark.parametrize("command", ["view", "track"])
 def test_a_full_disk_is_told_and_nothing_waits(

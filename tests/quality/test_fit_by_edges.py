@@ -38,6 +38,7 @@ def test_close_points_stand_out_from_those_of_random_rotations() -> None:
     assert far.by_chance is not None and far.share < 1.3 * far.by_chance < 0.6 * quality.share
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [-0.3, 0.3])
 def test_three_tenths_of_a_degree_are_visible(degrees: float) -> None:
     """About the vertical, at two thirds of the usual size: 2.5 px."""

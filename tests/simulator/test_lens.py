@@ -41,6 +41,7 @@ def lens(name: str) -> CameraModel:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["barrel", "fisheye"])
 def test_points_of_vehicles_fall_on_their_mask(name: str) -> None:
     """Exact labels, by the true extrinsic and the model; of the fisheye also far to its sides."""
@@ -66,6 +67,7 @@ def test_points_of_vehicles_fall_on_their_mask(name: str) -> None:
         assert (np.rad2deg(np.arccos(rays[:, 2])) > 60.0).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["barrel", "fisheye"])
 def test_a_rectified_street_is_the_pinholes(name: str) -> None:
     """Exact labels: the rectified mask is that of the rectified camera but for its contours."""

@@ -159,6 +159,7 @@ SHARED = np.array([*np.radians([0.06] * 3), 0.01, 0.01, 0.01, 0.004])
 """(7,) deviations of what matches of one kind share [rad, m, s]."""
 
 
+@pytest.mark.slow
 def test_the_product_is_the_estimate_of_one_graph() -> None:
     """All variables of both kinds in one linear system, with a copy of the calibration for each kind."""
     truth = simulated(SMALL).truth
