@@ -26,6 +26,7 @@ from sst_graph.covariance.cluster_robust import RobustCovariance
 from sst_graph.covariance.considered import columns_of, weighted_columns
 from sst_graph.covariance.match_table import MatchTable
 from sst_graph.covariance.sums import summed_rows
+from sst_graph.covariance.undecided_sweep import MATTERS
 from sst_graph.graph.matching import PairMatches
 from sst_graph.graph.state import State
 from sst_graph.types import FloatArray, IntArray
@@ -35,8 +36,6 @@ _LEAST_SIDES = 2
 told from the sides' scatter."""
 _UNITS = np.array([1.0, 1.0, 1e-3])
 """Pixels and milliseconds: variances are compared in these."""
-_MATTERS = 0.5
-"""Shifts are named where they make up more than this share of the sigma of an unknown."""
 _WIDEST_STAMP_S = 0.1
 """An image's stamp that its matches determine worse than this (the vehicle stands) is not fitted [s]."""
 
@@ -75,7 +74,7 @@ class ImageShifts:
         """Sentences that say that the pictures shift, or that their stamps jitter; none where it makes up
         little of a covariance (7, 7)."""
         of_picture, of_stamp = (
-            np.sqrt(np.diag(part)[:7] / np.diag(covariance)).max() > _MATTERS
+            np.sqrt(np.diag(part)[:7] / np.diag(covariance)).max() > MATTERS
             for part in (self.parts[:2].sum(axis=0), self.parts[2])
         )
         across, down, late_s = self.sigmas

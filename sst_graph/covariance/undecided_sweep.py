@@ -10,10 +10,8 @@ import numpy as np
 from sst_graph.odometry.sweep import REMEDY, SweepDecision
 from sst_graph.types import FloatArray
 
-MATTERS = 1.0
-"""An undecided sweep matters where one of its hypotheses moves an unknown by more than this many of the
-sigmas claimed. They cover all hypotheses by their probability, but an improbable one may move it by more.
-Below, whichever is true leaves the result within the sigmas that it states."""
+MATTERS = 0.5
+"""An undecided sweep matters where it makes up more than this share of the sigma claimed for an unknown."""
 
 
 @dataclass(frozen=True)
@@ -45,10 +43,9 @@ class SweepEffect:
         added = np.asarray(
             sum(decision.shares[fraction] * np.outer(step, step) for fraction, step in steps.items())
         )
-        sigmas = np.sqrt(np.diag(covariance + added))
-        worst = max(steps.values(), key=lambda step: float((np.abs(step) / sigmas).max()))
-        if (np.abs(worst) / sigmas).max() <= MATTERS:
+        if np.sqrt(np.diag(added) / np.diag(covariance + added)).max() <= MATTERS:
             return cls(added)
+        worst = max(steps.values(), key=lambda step: float((step**2 / np.diag(covariance)).max()))
         return cls(
             added,
             f"the scans do not show whether they are compensated ({decision.evidence}), and "

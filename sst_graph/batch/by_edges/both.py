@@ -15,6 +15,7 @@ from sst_graph.batch.by_edges.problem import LabelEstimate
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import MethodEstimate
 from sst_graph.batch.motion_factor import MAX_DISAGREEMENT_CHI2
+from sst_graph.covariance.undecided_sweep import MATTERS
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import EstimationError
 from sst_graph.fit import Fit
@@ -24,9 +25,6 @@ from sst_graph.types import Guess
 
 ByLabels = Callable[[Sequence[Drive], Guess, CalibrationConfig, Progress | None], MethodEstimate]
 
-_SWEEP_MATTERS = 0.5
-"""A sweep that a part leaves open stays open where it makes up more than this share of a fused sigma: of the
-steps that its hypotheses make, only the covariance is left."""
 _Part = MethodEstimate | str
 """An estimate, or why there is none."""
 _START_SIGMAS = np.array([*np.radians([0.3] * 3), 0.15, 0.15, 0.15, 0.03])
@@ -164,7 +162,7 @@ def _of_both_parts(labels: MethodEstimate, edges: MethodEstimate) -> MethodEstim
         covariance=fused.covariance,
         frames=tuple(dict.fromkeys((*labels.frames, *edges.frames))),
         reasons=_contradiction(fused),
-        open_sweeps=tuple(sweeps) if (shares > _SWEEP_MATTERS**2).any() else (),
+        open_sweeps=tuple(sweeps) if (shares > MATTERS**2).any() else (),
         remarks=(*labels.remarks, *edges.remarks),
         by_static_objects=static,
         diagnostics=diagnostics
