@@ -7,7 +7,7 @@ It stays in memory beside the result (:attr:`sst_graph.result.CalibrationResult.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -97,6 +97,13 @@ class MeasuredFit:
             "mask_bias_px": dict(self.bias_px),
             **{name: None if one is None else one.to_dict() for name, one in parts.items()},
         }
+
+
+def bias_entry(
+    drives: Sequence[str], biases_px: Mapping[tuple[int, SemanticClass], float]
+) -> dict[str, float]:
+    """Biases by (number of the drive, class) [px] as an entry of the diagnostics."""
+    return {f"{drives[d]}:{c.name.lower()}": bias for (d, c), bias in biases_px.items()}
 
 
 def mask_biases_px(

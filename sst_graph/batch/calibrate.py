@@ -121,16 +121,11 @@ def prepare_drives(
     if config.method == "edges":
         sources = [GeometricallyLabelled(source) for source in sources]
     # One drive after the other, for the frames that the sweep is decided by are kept until they are read.
-    swept = (with_sweep(source, config.decide_sweep, _of_sweep(source, progress)) for source in sources)
+    swept = (with_sweep(source, config.decide_sweep, progress) for source in sources)
     return [
         prepare_drive(source, prepared_classes(config), prepare, progress, depth, with_lower_edges)
         for source in swept
     ]
-
-
-def _of_sweep(source: Source, progress: Progress | None) -> Callable[[int, int], None] | None:
-    """The progress of the decision about a source's sweep."""
-    return None if progress is None else partial(progress, f"sweep of {source.name}")
 
 
 def preparation_of(config: CalibrationConfig) -> PrepareConfig:

@@ -11,7 +11,7 @@ from sst_graph.batch.assumption_tests import estimated_report
 from sst_graph.batch.lower_edges import WithLowerEdges
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.drive.preparation import Drive
-from sst_graph.fit import Fit, Profile
+from sst_graph.fit import MASK_BIAS, Fit, Profile, bias_entry
 from sst_graph.graph.outer_loop import (
     JointSolution,
     agreement,
@@ -84,9 +84,7 @@ def joint_diagnostics(
         "outer_iterations": solution.outer_iterations,
         "matches": sum(len(pair) for pair in solution.pairs),
         "pairs": len(solution.pairs),
-        "mask_bias_px": {
-            f"{drives[d].name}:{c.name.lower()}": bias for (d, c), bias in solution.state.biases_px.items()
-        },
+        MASK_BIAS: bias_entry([drive.name for drive in drives], solution.state.biases_px),
         "lower_edge_concentration": {c.name.lower(): share for c, share in lower.concentration.items()},
         "lower_edges": [c.name.lower() for c in lower.joint.graph.lower_edges],
         "error_model": {"side": model.side, "side_frame": model.side_frame, "match": model.match},

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,7 +40,7 @@ class EstimatedCamera(PinholeCamera):
     @classmethod
     def of(cls, result: CalibrationResult) -> EstimatedCamera:
         """The camera of a result, with the parameters of its assumptions in the terms of OpenCV."""
-        given, values = result.camera, _estimated(result.diagnostics.get("estimated"))
+        given, values = result.camera, estimated_values(result, _PARAMETERS)
         size, larger = (given.width, given.height), 1.0 + values.get("focal", 0.0)
         cx, cy = given.cx + values.get("cx", 0.0), given.cy + values.get("cy", 0.0)
         try:
@@ -76,10 +76,10 @@ class EstimatedCamera(PinholeCamera):
         ]
 
 
-def _estimated(found: object) -> dict[str, float]:
-    """Values of the lens's parameters among those that were estimated; a file may hold anything."""
-    values = {}
-    for name in _PARAMETERS:
+def estimated_values(result: CalibrationResult, names: Iterable[str]) -> dict[str, float]:
+    """Values of those of the parameters that were estimated with the pose; a file may hold anything."""
+    found, values = result.diagnostics.get("estimated"), {}
+    for name in names:
         entry = found.get(name) if isinstance(found, Mapping) else None
         value = entry.get("value") if isinstance(entry, Mapping) else None
         if isinstance(value, float) and np.isfinite(value):

@@ -18,6 +18,7 @@ from sst_graph.cli.drive_odometry import DriveOdometry
 from sst_graph.data.frame_parts import RecentReader, image_positions, scan_positions
 from sst_graph.errors import DataError, count_of
 from sst_graph.factors.camera import PinholeCamera
+from sst_graph.features.mask_contour import ContourMap
 from sst_graph.fit import MatchedFrame, mask_biases_px
 from sst_graph.odometry.lidar import lidar_odometry
 from sst_graph.quality.frame_share import ClosePoints, close_points
@@ -25,7 +26,7 @@ from sst_graph.report.drawn_frame import DrawnFrame
 from sst_graph.result import CalibrationResult
 from sst_graph.sampling import evenly_spread
 from sst_graph.types import CameraImage, FloatArray, Frame, Scan, SemanticClass, Source
-from sst_graph.viz import Placement, draw_overlay, stacked
+from sst_graph.viz import Placement, draw_placement, stacked
 
 
 def position_of(drive: RecentReader, index: int) -> int:
@@ -127,12 +128,10 @@ def overlay(shown: ShownFrame, result: CalibrationResult, before: Placement | No
         shown.time_offset_s,
         "after (image closest in time)" if shown.other_image else "after",
     )
-    close = close_points(shown.frame, own, at, c_twist, bias_px)
-    after = _drawn(shown.frame, own, at, c_twist, close)
+    after, close = _drawn(shown.frame, own, at, c_twist, bias_px)
     if before is None:
         return Overlay(after, close, None)
-    close_before = close_points(shown.own, camera, before, c_twist, bias_px)
-    above = _drawn(shown.own, camera, before, c_twist, close_before)
+    above, close_before = _drawn(shown.own, camera, before, c_twist, bias_px)
     return Overlay(stacked(above, after), close, close_before)
 
 
@@ -141,11 +140,13 @@ def _drawn(
     camera: PinholeCamera,
     at: Placement,
     c_twist: FloatArray | None,
-    close: ClosePoints | None,
-) -> NDArray[np.uint8]:
-    """The picture of a placement, its close points in the caption."""
-    caption = at.caption if close is None else f"{at.caption}: {close.words}"
-    return draw_overlay(frame, camera, at.cTl, at.time_offset_s, c_twist, caption)
+    bias_px: float,
+) -> tuple[NDArray[np.uint8], ClosePoints | None]:
+    """The picture of a placement, its close points in the caption, and these."""
+    contour = None if frame.image is None else ContourMap.in_image(frame.image, SemanticClass.VEHICLE)
+    close = close_points(frame, contour, camera, at, c_twist, bias_px)
+    captioned = at if close is None else replace(at, caption=f"{at.caption}: {close.words}")
+    return draw_placement(frame, contour, camera, captioned, c_twist), close
 
 
 def close_words(after: ClosePoints | None, before: ClosePoints | None) -> str:

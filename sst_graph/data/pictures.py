@@ -20,6 +20,10 @@ from sst_graph.types import NO_PICTURE, CameraImage, SemanticClass
 _MASKS_TO_JUDGE = 8
 """How many masks, spread over the drive, decide on their encoding."""
 
+_ANOTHER_SIZE = 0.15
+"""A principal point is farther from the middle of pictures of another size than its own, by this: the sum
+across and down of the logarithms of the ratios. It is that of a change of size by 8 %."""
+
 
 @dataclass(frozen=True)
 class PictureFiles:
@@ -81,11 +85,6 @@ def check_scale(
         f"pictures were scaled, scale fx and cx by {w / width:.4g}, fy and cy by {h / height:.4g}, and use "
         "masks of the pictures' size",
     )
-
-
-_ANOTHER_SIZE = 0.15
-"""A principal point is farther from the middle of pictures of another size than its own, by this: the sum
-across and down of the logarithms of the ratios. It is that of a change of size by 8 %."""
 
 
 def _off_middle(size: tuple[int, int], centre: tuple[float, float]) -> float:

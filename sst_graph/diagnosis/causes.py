@@ -89,9 +89,10 @@ def _found_by_halves(drive: Drive, anywhere: Guess, fit: Fitter) -> LabelFit | N
     drive show too little, and its own agreement has to be better.
     """
     found, middle = fit(drive, anywhere), len(drive.scans) // 2
-    if found is None or found.quality < (_FREE_QUALITY if middle >= _LEAST_HALF else _SHORT_QUALITY):
+    halves = [range(middle), range(middle, len(drive.scans))] if middle >= _LEAST_HALF else []
+    if found is None or found.quality < (_FREE_QUALITY if halves else _SHORT_QUALITY):
         return None
-    for half in (range(middle), range(middle, len(drive.scans))) if middle >= _LEAST_HALF else ():
+    for half in halves:
         again = fit(drive.part(half), anywhere)
         if again is None or quaternion_angle_deg(again.cTl.rotation(), found.cTl.rotation()) > THERE_DEG:
             return None

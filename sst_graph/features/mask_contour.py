@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sst_graph.features.image_edges import FloatMap, Picture, PictureEdges, find_picture_edges
 from sst_graph.features.sampling import sampled
 from sst_graph.files.array_store import ArrayStore, shape_of, storable
-from sst_graph.types import FloatArray, IntArray, PixelStretch, SemanticClass
+from sst_graph.types import CameraImage, FloatArray, IntArray, PixelStretch, SemanticClass
 
 _SMOOTHING_PX = 1.0
 """Gaussian smoothing of the distances [px]: a mask's contour is a staircase of pixels."""
@@ -71,6 +71,11 @@ class ContourMap:
     unknown: NDArray[np.uint8]
     edges: PictureEdges | None = None
     stretch: PixelStretch | None = None
+
+    @classmethod
+    def in_image(cls, image: CameraImage, semantic_class: SemanticClass) -> ContourMap | None:
+        """The field of a class in an image, whose contours follow its picture; None as of :meth:`of`."""
+        return cls.of(image.mask, semantic_class, image.pixels, valid=image.valid)
 
     @classmethod
     def of(

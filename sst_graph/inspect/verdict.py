@@ -61,15 +61,19 @@ def verdict(result: CalibrationResult) -> str:
 
 def _verdict(result: CalibrationResult) -> str:
     if result.status == "not_converged":
-        first = next(iter(leading_reasons(result)[0]), "the estimate contradicts the data")
-        return f"Do not use this calibration: {as_sentence(first)}"
+        return f"Do not use this calibration: {_why(result, 'the estimate contradicts the data')}"
     if is_start(result):
-        first = next(iter(leading_reasons(result)[0]), "no frame could be used")
-        return f"No estimate: {as_sentence(first)} What stands in this result is the start."
+        why = _why(result, "no frame could be used")
+        return f"No estimate: {why} What stands in this result is the start."
     if result.status == "unobservable":
-        first = next(iter(leading_reasons(result)[0]), "the data leave a direction open")
-        return f"Not finished: {as_sentence(first)} As it is: {_known(result)}"
+        return f"Not finished: {_why(result, 'the data leave a direction open')} As it is: {_known(result)}"
     return f"Good to {_known(result)}"
+
+
+def _why(result: CalibrationResult, otherwise: str) -> str:
+    """The first reason as a sentence, or what is said where there is none."""
+    leading, _ = leading_reasons(result)
+    return as_sentence(leading[0] if leading else otherwise)
 
 
 def quality_line(quality: FitQuality, with_attainable: bool = True) -> str:

@@ -45,20 +45,25 @@ class ClosePoints:
 
 
 def close_points(
-    frame: Frame, camera: PinholeCamera, at: Calibration, c_twist: FloatArray | None, bias_px: float = 0.0
+    frame: Frame,
+    contour: ContourMap | None,
+    camera: PinholeCamera,
+    at: Calibration,
+    c_twist: FloatArray | None,
+    bias_px: float = 0.0,
 ) -> ClosePoints | None:
     """Boundary points of vehicles in a frame and its mask; None where either has no labels.
 
     The share of a whole drive leaves out objects that move; here they count as if they stood.
 
     Args:
+        contour: of the vehicles in the frame's mask; None where it has none.
         c_twist: (6,) of the camera at the image [rad/s, m/s]; None: at rest.
         bias_px: of the masks of vehicles [px].
     """
     scan, image = frame.scan, frame.image
     if scan is None or image is None or not scan.has_labels or not image.has_mask:
         return None
-    contour = ContourMap.of(image.mask, SemanticClass.VEHICLE, image.pixels, valid=image.valid)
     boundaries = apart(find_boundaries(scan, (SemanticClass.VEHICLE,), with_lower_edges=False))[0]
     if contour is None or not boundaries:
         return ClosePoints(0, 0)

@@ -330,7 +330,7 @@ def _picture_edges(points: PointResiduals, crop: _Crop) -> str:
 def _contour_path(drawn: DrawnFrame, points: PointResiduals, crop: _Crop) -> str:
     """The contour of the object's class within the crop, below a pixel, as the path of an SVG."""
     semantic_class = SemanticClass(int(points.classes[0]))
-    contour = ContourMap.of(drawn.image.mask, semantic_class, drawn.image.pixels, valid=drawn.image.valid)
+    contour = ContourMap.in_image(drawn.image, semantic_class)
     if contour is None:
         return ""
     rows, columns = contour.distance.shape

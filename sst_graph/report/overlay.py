@@ -146,7 +146,7 @@ def _contours(drawn: DrawnFrame, classes: Sequence[SemanticClass], scale: float)
     """Outlines of the classes, column and row in turn [px of the drawn picture]."""
     found = []
     for c in classes:
-        contour = ContourMap.of(drawn.image.mask, c, drawn.image.pixels, valid=drawn.image.valid)
+        contour = ContourMap.in_image(drawn.image, c)
         if contour is None:
             continue
         inside = (contour.distance < 0.0).astype(np.uint8)

@@ -284,8 +284,7 @@ def _points_of(fit: Fit, frame: MatchedFrame) -> np.ndarray[Any, np.dtype[np.boo
 
 
 def _placements(result: CalibrationResult, drive: str) -> Placements:
-    own = {one.drive: one.time_offset_s for one in result.drive_offsets}
-    after = Calibration(result.T_camera_lidar, own.get(drive, result.time_offset_s))
+    after = Calibration(result.T_camera_lidar, result.time_offset_of(drive))
     before = None if result.initial is None else Calibration(result.initial, result.initial_time_offset_s)
     return Placements(before, after, EstimatedCamera.of(result))
 

@@ -16,6 +16,7 @@ def main() -> None:
     """Work until SIGINT or SIGTERM; then use what waits, solve the whole window, and publish that."""
     from rclpy.clock import Clock, ClockType
     from rclpy.duration import Duration
+    from rclpy.exceptions import NameValidationException
     from rclpy.executors import SingleThreadedExecutor
 
     # 1. The node and its core, by the parameters, which cannot be changed from then on.
@@ -25,7 +26,8 @@ def main() -> None:
     fixed = partial(descriptor, read_only=True, dynamic_typing=True)
     settings, config = read_settings(node, fixed)
     name = node.get_fully_qualified_name().lstrip("/")
-    core = CalibrationNode(with_resolved_topics(node, settings), config, name)
+    refusals = RuntimeError, ValueError, NameValidationException
+    core = CalibrationNode(with_resolved_topics(node, settings, refusals), config, name)
     # 2. What is published comes of messages, and of a timer that runs where /clock stands still.
     bridge = Bridge(node, core)
     bridge.listen(settings, partial(subscribe, node))

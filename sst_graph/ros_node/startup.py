@@ -49,8 +49,13 @@ def read_settings(node: Any, descriptor: Callable[[], Any]) -> tuple[NodeSetting
     return node_settings(values)
 
 
-def with_resolved_topics(node: Any, settings: NodeSettings) -> NodeSettings:
+def with_resolved_topics(
+    node: Any, settings: NodeSettings, refusals: tuple[type[Exception], ...]
+) -> NodeSettings:
     """``settings`` with the names that the topics have in the graph: in the namespace, and remapped.
+
+    Args:
+        refusals: what the node raises for a name that no topic can have.
 
     Raises:
         ConfigError: a name that no topic can have.
@@ -60,6 +65,6 @@ def with_resolved_topics(node: Any, settings: NodeSettings) -> NodeSettings:
     for name, value in given.items():
         try:
             found[name] = node.resolve_topic_name(value) if value else ""
-        except Exception as error:  # rclpy has kinds of its own for names
+        except refusals as error:
             raise ConfigError(f"{name}: found {value!r}: {' '.join(str(error).split())}") from None
     return dataclasses.replace(settings, **found)

@@ -11,6 +11,7 @@ from sst_graph.batch.method_estimate import package_versions
 from sst_graph.config import to_dict
 from sst_graph.covariance.observability import reasons_of
 from sst_graph.factors.arguments import checked_type
+from sst_graph.fit import MASK_BIAS
 from sst_graph.inspect.gained import KEY, to_document
 from sst_graph.result import CalibrationResult, FrameId, Status
 from sst_graph.tracker.track_update import TrackUpdate, current_update
@@ -72,7 +73,7 @@ def tracker_result(tracker: Tracker, drive: str, camera_name: str) -> Calibratio
         diagnostics={
             "scans": window.next_scan,
             "matches": last.matches,
-            "mask_bias_px": {
+            MASK_BIAS: {
                 c.name.lower(): bias
                 for (_, c), bias in estimate.point.state(config.calibration.classes).biases_px.items()
             },

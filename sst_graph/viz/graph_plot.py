@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from sst_graph.fit import MASK_BIAS
 from sst_graph.inspect.inspection import Inspection
 
 MOST_FRAMES = 6
@@ -26,7 +27,7 @@ def draw_graph(figure: Any, inspection: Inspection) -> Any:
     tops = {"E": ((n - 1) * 0.5 - 0.8, _TOP)}
     for k, drive in enumerate(offsets or [""]):
         tops[f"D{drive}"] = ((n - 1) * 0.5 + 0.8 + 1.1 * k, _TOP)
-    biases = _biases(result.diagnostics.get("mask_bias_px"), {drive for drive, _ in shown})
+    biases = _biases(result.diagnostics.get(MASK_BIAS), {drive for drive, _ in shown})
     bases = {
         key: ((n - 1) * (k + 1) / (len(biases) + 1) if n > 1 else float(k), _BIAS)
         for k, key in enumerate(biases)

@@ -78,25 +78,39 @@ def draw_overlay(
     Raises:
         DataError: the frame lacks its scan or its image, or the image has another size than the camera.
     """
+    contour = None if frame.image is None else ContourMap.in_image(frame.image, SemanticClass.VEHICLE)
+    return draw_placement(frame, contour, camera, Placement(cTl, time_offset_s, caption), c_twist)
+
+
+def draw_placement(
+    frame: Frame,
+    contour: ContourMap | None,
+    camera: PinholeCamera,
+    at: Placement,
+    c_twist: FloatArray | None = None,
+) -> Picture:
+    """As :func:`draw_overlay`, where the contour of the image's vehicles is known.
+
+    Raises:
+        DataError: the frame lacks its scan or its image, or the image has another size than the camera.
+    """
     scan, image = _both(frame, camera)
-    uvs, classes, depths_m = _projected(scan, image, camera, cTl, time_offset_s, c_twist)
+    uvs, classes, depths_m = _projected(scan, image, camera, at.cTl, at.time_offset_s, c_twist)
     zoom = -(-MIN_WIDTH_PX // camera.width)
     picture = _enlarged(_backdrop(image), zoom)
-    _draw_contours(
-        picture, ContourMap.of(image.mask, SemanticClass.VEHICLE, image.pixels, valid=image.valid), zoom
-    )
+    _draw_contours(picture, contour, zoom)
     mask_class = _at(image.mask, uvs)[classes == SemanticClass.VEHICLE]
     uvs = (uvs + 0.5) * zoom - 0.5
     if not scan.has_labels:
         _draw_points(picture, uvs, _depth_colours(depths_m), 2)
-        return np.vstack([_strip(picture.shape[1], _by_depth(caption)), picture])
+        return np.vstack([_strip(picture.shape[1], _by_depth(at.caption)), picture])
     _draw_classes(picture, uvs, classes)
     vehicles = uvs[classes == SemanticClass.VEHICLE]
     inside = mask_class == SemanticClass.VEHICLE
     outside = ~inside & (mask_class != SemanticClass.IGNORE)
     _draw_points(picture, vehicles[inside], IN_MASK, 2)
     _draw_points(picture, vehicles[outside], OUT_OF_MASK, 2)
-    words = _by_class(caption, int(inside.sum()), int(outside.sum()))
+    words = _by_class(at.caption, int(inside.sum()), int(outside.sum()))
     return np.vstack([_strip(picture.shape[1], words), picture])
 
 

@@ -1,4 +1,4 @@
-"""A calibration that is no longer the one that its figures were made for."""
+"""A result whose calibration is another than the one that its figures are of."""
 
 from __future__ import annotations
 

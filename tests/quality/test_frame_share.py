@@ -11,6 +11,8 @@ from streets import crowded_street
 
 from sst_graph.cameras.estimated_camera import EstimatedCamera
 from sst_graph.cli.pictures import close_words
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.features.mask_contour import ContourMap
 from sst_graph.quality.frame_share import ClosePoints, close_points
 from sst_graph.types import Calibration, Frame, SemanticClass
 
@@ -29,12 +31,19 @@ def _turned(at: Calibration, axis: int) -> Calibration:
     return replace(at, cTl=at.cTl.compose(gtsam.Pose3.Expmap(step)))
 
 
+def _close(
+    frame: Frame, camera: PinholeCamera, at: Calibration, c_twist: None, bias_px: float = 0.0
+) -> ClosePoints | None:
+    contour = None if frame.image is None else ContourMap.in_image(frame.image, SemanticClass.VEHICLE)
+    return close_points(frame, contour, camera, at, c_twist, bias_px)
+
+
 @pytest.mark.parametrize("axis", [1, 2])
 def test_three_tenths_of_a_degree_show(axis: int) -> None:
     """At half the usual size, where they are 1.9 px."""
     frame, true = _street()
     camera = crowded_street().camera
-    right, wrong = (close_points(frame, camera, at, None) for at in (true, _turned(true, axis)))
+    right, wrong = (_close(frame, camera, at, None) for at in (true, _turned(true, axis)))
     assert right is not None and wrong is not None and right.points > 50
     assert wrong.close / wrong.points < 0.75 * right.close / right.points
 
@@ -43,7 +52,7 @@ def test_masks_that_are_drawn_too_large_count_with_their_bias() -> None:
     """A bias that is given moves the residuals by as much."""
     frame, true = _street()
     camera = crowded_street().camera
-    right, off = (close_points(frame, camera, true, None, bias) for bias in (0.0, 4.0))
+    right, off = (_close(frame, camera, true, None, bias) for bias in (0.0, 4.0))
     assert right is not None and off is not None
     assert off.close / off.points < 0.5 * right.close / right.points
 
@@ -53,7 +62,7 @@ def test_an_estimated_lens_is_that_of_the_picture() -> None:
     camera = crowded_street().camera
     plain = EstimatedCamera(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
     bent = replace(plain, k1=0.1)
-    found = [close_points(frame, one, true, None) for one in (camera, plain, bent)]
+    found = [_close(frame, one, true, None) for one in (camera, plain, bent)]
     assert found[0] == found[1] and found[1] is not None and found[2] is not None
     assert found[2].close / found[2].points < 0.9 * found[1].close / found[1].points
 
@@ -67,8 +76,8 @@ def test_without_labels_there_is_no_share() -> None:
     unmasked = replace(image, mask=np.full_like(image.mask, SemanticClass.IGNORE))
     empty = replace(image, mask=np.full_like(image.mask, SemanticClass.GROUND))
     for other in (replace(frame, scan=unlabelled), replace(frame, image=unmasked), replace(frame, scan=None)):
-        assert close_points(other, camera, true, None) is None
-    assert close_points(replace(frame, image=empty), camera, true, None) == ClosePoints(0, 0)
+        assert _close(other, camera, true, None) is None
+    assert _close(replace(frame, image=empty), camera, true, None) == ClosePoints(0, 0)
 
 
 def test_words() -> None:

@@ -82,10 +82,11 @@ def test_parameters_are_declared_anew_and_others_are_warned_of() -> None:
 
 
 def test_topics_get_their_names_in_the_graph() -> None:
-    found = with_resolved_topics(Node(), NodeSettings(image_topic="front", cloud_topic="/points"))
+    settings = NodeSettings(image_topic="front", cloud_topic="/points")
+    found = with_resolved_topics(Node(), settings, (ValueError,))
     assert (found.image_topic, found.cloud_topic, found.mask_topic) == ("/car/front", "/points", "")
     with pytest.raises(ConfigError, match="info_topic: found 'a b': Invalid topic name: no blanks"):
-        with_resolved_topics(Node(), NodeSettings(info_topic="a b"))
+        with_resolved_topics(Node(), NodeSettings(info_topic="a b"), (ValueError,))
 
 
 @pytest.mark.parametrize(
@@ -128,7 +129,7 @@ def test_the_bridge_listens_to_all_topics_and_publishes(monkeypatch: pytest.Monk
         monkeypatch.setitem(sys.modules, f"{package}_msgs", ModuleType(f"{package}_msgs"))
         monkeypatch.setitem(sys.modules, f"{package}_msgs.msg", messages)
     node, settings = Node(), NodeSettings(mask_topic="mask", init="none")
-    core = CalibrationNode(with_resolved_topics(node, settings), name="car")
+    core = CalibrationNode(with_resolved_topics(node, settings, (ValueError,)), name="car")
     bridge, heard = Bridge(node, core), dict[str, tuple[str, Any]]()
 
     def subscribe(one: Subscription, quality: Quality) -> None:

@@ -34,7 +34,7 @@ from sst_graph.batch.problem import CalibrationProblem, JointEstimate, MatchedDr
 from sst_graph.batch.total_covariance import sweep_effects
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.drive.stages import run_stage, stage
-from sst_graph.fit import EDGE_BIAS, Fit, Profile
+from sst_graph.fit import EDGE_BIAS, Fit, Profile, bias_entry
 from sst_graph.graph.outer_loop import JointSolution
 from sst_graph.hand_eye.solution import MotionSolution
 from sst_graph.quality.profiles import score_profiles
@@ -110,10 +110,7 @@ def edges_method(
         by_static_objects=covariance,
         diagnostics={
             **_diagnostics(solution, contrast, motion),
-            EDGE_BIAS: {
-                f"{drives[d].name}:{c.name.lower()}": bias_px
-                for (d, c), bias_px in solution.state.biases_px.items()
-            },
+            EDGE_BIAS: bias_entry([drive.name for drive in drives], solution.state.biases_px),
             "spread": {**own.sigmas, "farther_edges": np.abs(farther_step).tolist()},
             "assumptions": dict(own.assumptions),
             "estimated": dict(own.estimated),

@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from sst_graph.batch.by_edges.problem import with_fewer_points
 from sst_graph.batch.config import CalibrationConfig, prepared_classes
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.batch.sources import as_sources
+from sst_graph.cameras.estimated_camera import estimated_values
 from sst_graph.config import from_dict
 from sst_graph.drive.geometric_labels import GeometricallyLabelled
 from sst_graph.drive.preparation import Progress, check_progress, prepare_drive
@@ -78,8 +78,7 @@ def measure_fit(result: CalibrationResult, source: Source, progress: Progress | 
     if isinstance(decided, Mapping) and source.name in decided:
         source = with_sweep_of(source, result.diagnostics)
     else:
-        told = None if progress is None else partial(progress, f"sweep of {source.name}")
-        source = with_sweep(source, config.decide_sweep, told)
+        source = with_sweep(source, config.decide_sweep, progress)
     labels: FitQuality | None = None
     biases: dict[SemanticClass, float] = {}
     if with_method_for(replace(config, method="auto"), [source]).method != "edges":
@@ -124,7 +123,7 @@ def _quality(
     of_edges = result.diagnostics.get("edges")
     kept = of_edges if by_edges and isinstance(of_edges, Mapping) else result.diagnostics
     biases = mask_biases_px(kept, source.name, EDGE_BIAS if by_edges else MASK_BIAS)
-    nuisances = _nuisances(result) if result.camera == source.camera else {}
+    nuisances = estimated_values(result, ASSUMPTIONS) if result.camera == source.camera else {}
 
     def measured() -> Fit | None:
         of_drive = {(0, c): bias for c, bias in biases.items()}
@@ -154,23 +153,7 @@ def width_bias_px(points: PointResiduals, semantic_class: int) -> float:
     return -float(np.mean([np.median(side) for side in sides]))
 
 
-def _nuisances(result: CalibrationResult) -> dict[str, float]:
-    """Values of the assumptions' parameters that were estimated with the pose."""
-    found = result.diagnostics.get("estimated")
-    if not isinstance(found, Mapping):
-        return {}
-    entries = {name: found[name] for name in ASSUMPTIONS if isinstance(found.get(name), Mapping)}
-    values = {name: _number(entry.get("value")) for name, entry in entries.items()}
-    return {name: value for name, value in values.items() if value is not None}
-
-
 def _classes(names: Any) -> tuple[SemanticClass, ...]:
     """Classes by their names in a result's diagnostics, those that are known."""
     known = {c.name.lower(): c for c in SemanticClass}
     return tuple(known[name] for name in names if name in known) if isinstance(names, list) else ()
-
-
-def _number(value: Any) -> float | None:
-    """A finite number in a result's diagnostics, else None."""
-    good = isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
-    return float(value) if good else None

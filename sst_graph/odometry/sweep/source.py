@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from sst_graph.data.frame_parts import (
@@ -63,7 +64,7 @@ def timed(scan: Scan, timing: SweepTiming) -> Scan:
 
 
 def with_sweep(
-    source: Source, decide: bool = True, progress: Callable[[int, int], None] | None = None
+    source: Source, decide: bool = True, progress: Callable[[str, int, int], None] | None = None
 ) -> SweptSource:
     """The source with times for its points, decided from its scans; scans read for that are not read again.
 
@@ -73,7 +74,7 @@ def with_sweep(
 
     Args:
         decide: False leaves scans without times as they are, and compares nothing.
-        progress: called with (steps done, steps in all) while it is decided.
+        progress: called with (stage, steps done, steps in all) while it is decided.
 
     Raises:
         DataError: a frame cannot be read.
@@ -98,7 +99,7 @@ def with_sweep(
         len(positions),
         stamp,
         MAX_WINDOWS if turn_s is None else _COMPARED_WINDOWS,
-        progress,
+        None if progress is None else partial(progress, f"sweep of {source.name}"),
     )
     decision = replace(decision, frames=tuple(positions[k] for k in decision.frames))
     if turn_s is not None:
