@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any
 
 import cv2
@@ -44,6 +45,8 @@ _LEGEND_DEPTHS_M = 3, 10, 30, 60
 MIN_WIDTH_PX = 720
 """Smaller pictures are enlarged by a whole factor to at least this width."""
 
+_LEAST_SCALE = 0.1
+"""Of letters: smaller ones cannot be read."""
 TIME_STEP_S = 0.5e-3
 """Points of a rolling sweep are moved in steps of this [s]; at 15 m/s the rest is 4 mm."""
 
@@ -262,13 +265,17 @@ def _by_depth(caption: str) -> list[tuple[str, Colour]]:
 def _strip(width: int, legend: list[tuple[str, Colour]]) -> Picture:
     """A strip of ``width`` pixels with words in their colours, in letters that fit."""
     parts = [(f"{words}   ", colour) for words, colour in legend if words]
-    text = "".join(words for words, _ in parts).rstrip()
     font, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.6
-    (length, height), _ = cv2.getTextSize(text, font, scale, 1)
-    scale *= min(1.0, (width - 16) / length)
+    height = cv2.getTextSize("".join(words for words, _ in parts), font, scale, 1)[0][1]
+
+    def ends() -> list[int]:
+        widths = [cv2.getTextSize(words, font, scale, 1)[0][0] for words, _ in parts]
+        return list(accumulate(widths, initial=8))
+
+    # As they are drawn, part by part: widths are whole pixels, and do not shrink quite as the scale does.
+    while (over := ends()[-1] / (width - 8)) > 1.0 and scale > _LEAST_SCALE:
+        scale /= max(over, 1.01)
     strip = np.full((height + 14, width, 3), 30, np.uint8)
-    left = 8
-    for words, colour in parts:
+    for (words, colour), left in zip(parts, ends(), strict=False):
         cv2.putText(strip, words, (left, height + 6), font, scale, colour, 1, cv2.LINE_AA)
-        left += cv2.getTextSize(words, font, scale, 1)[0][0]
     return strip

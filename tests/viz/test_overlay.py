@@ -12,7 +12,7 @@ from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.types import CameraImage, Frame, Scan, SemanticClass
 from sst_graph.viz import draw_overlay
-from sst_graph.viz.overlay import CONTOUR, IN_MASK, MIN_WIDTH_PX, NOT_MATCHED, OUT_OF_MASK, legend_of
+from sst_graph.viz.overlay import CONTOUR, IN_MASK, MIN_WIDTH_PX, NOT_MATCHED, OUT_OF_MASK, _strip, legend_of
 
 CAMERA = PinholeCamera(500.0, 500.0, 400.0, 100.0, 800, 200)
 WHERE = gtsam.Pose3()
@@ -134,3 +134,13 @@ def test_an_image_of_another_size_is_refused() -> None:
     frame = _frame([[0, 0, 10]], [SemanticClass.VEHICLE])
     with pytest.raises(DataError, match="found an image of 800x200, expected 640x200"):
         draw_overlay(frame, replace(CAMERA, width=640), WHERE, 0.0)
+
+
+@pytest.mark.parametrize("width", [720, 1000, 1242])
+@pytest.mark.parametrize("count", [1, 4, 12, 30])
+def test_words_over_the_picture_fit(width: int, count: int) -> None:
+    """The last word ends inside of the strip, however many there are."""
+    legend = [(f"vehicle points {k}", (255, 255, 255)) for k in range(count - 1)] + [("end", IN_MASK)]
+    strip = _strip(width, legend)
+    _, columns = np.nonzero(strip[..., 1].astype(int) - strip[..., 2] > 40)
+    assert strip.shape[1] == width and columns.size and columns.max() < width - 4
