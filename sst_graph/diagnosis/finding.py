@@ -6,6 +6,11 @@ from dataclasses import dataclass
 
 INVERTED = "the start (Tr) is inverted", "give T_camera_lidar, from LiDAR to camera"
 """Cause and check of a start that leads from the camera to the LiDAR, by whatever data it is found."""
+OF_LINK = (
+    "the start (Tr) is that of the camera's link (x forward, y left, z up)",
+    "give the pose in its optical frame (x right, y down, z forward)",
+)
+"""Cause and check of a start whose camera axes are not the optical ones."""
 
 
 @dataclass(frozen=True)

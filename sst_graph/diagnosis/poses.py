@@ -10,9 +10,9 @@ import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sst_graph.diagnosis.finding import Finding
+from sst_graph.diagnosis.finding import OF_LINK, Finding
 from sst_graph.diagnosis.fit import LabelFit
-from sst_graph.metrics import quaternion_angle_deg
+from sst_graph.metrics import FORWARD_R_OPTICAL, quaternion_angle_deg
 from sst_graph.types import FloatArray
 
 _SEQUENCES = ("xyz", "zyx", "XYZ", "ZYX", "yxz", "YXZ", "zxy", "ZXY")
@@ -48,15 +48,19 @@ def wrong_start(guess: gtsam.Pose3, free: LabelFit | None) -> Finding | None:
 
 
 def start_finding(guess: gtsam.Pose3, found: LabelFit, finding: Finding) -> Finding:
-    """The finding, unless the start's angles were just taken in the wrong unit."""
+    """The finding, unless the start's angles were just taken in the wrong unit, or its axes are a link's."""
+    start, right = guess.rotation(), found.cTl.rotation()
+    link_deg = quaternion_angle_deg(FORWARD_R_OPTICAL.inverse() * start, right)
+    known = [(link_deg, *OF_LINK)]
     for factor, unit, other in (
         (np.pi / 180.0, "radians", "degrees"),
         (180.0 / np.pi, "degrees", "radians"),
     ):
-        if _converted(guess.rotation(), found.cTl.rotation(), factor):
-            cause = f"the angles of the start (Tr) are {unit} that were taken as {other}"
-            return replace(finding, cause=cause, check="convert them before the rotation is made")
-    return finding
+        cause = f"the angles of the start (Tr) are {unit} that were taken as {other}"
+        check = "convert them before the rotation is made"
+        known.append((_converted_deg(start, right, factor), cause, check))
+    nearest_deg, cause, check = min(known)
+    return replace(finding, cause=cause, check=check) if nearest_deg < _NEAR_DEG else finding
 
 
 def other_camera(
@@ -89,12 +93,12 @@ def other_camera(
     )
 
 
-def _converted(guess: gtsam.Rot3, found: gtsam.Rot3, factor: float) -> bool:
-    """Whether the start's angles are those of the found rotation, times a factor.
+def _converted_deg(guess: gtsam.Rot3, found: gtsam.Rot3, factor: float) -> float:
+    """How far the start is from the found rotation with its angles times a factor [deg].
 
     They are angles of a rig as designed, in right angles: in the wrong unit a degree more is a radian more.
     """
-    wanted = guess.matrix()
+    nearest = 180.0
     for inverse, sequence in product((False, True), _SEQUENCES):
         R = found.matrix().T if inverse else found.matrix()
         with warnings.catch_warnings():
@@ -103,9 +107,8 @@ def _converted(guess: gtsam.Rot3, found: gtsam.Rot3, factor: float) -> bool:
             angles = Rotation.from_matrix(_right_angled(R)).as_euler(sequence)
         right = 0.5 * np.pi * np.round(angles / (0.5 * np.pi))
         wrong = Rotation.from_euler(sequence, right * factor).as_matrix()
-        if quaternion_angle_deg(gtsam.Rot3(wrong.T if inverse else wrong), gtsam.Rot3(wanted)) < _NEAR_DEG:
-            return True
-    return False
+        nearest = min(nearest, quaternion_angle_deg(gtsam.Rot3(wrong.T if inverse else wrong), guess))
+    return nearest
 
 
 def _right_angled(R: FloatArray) -> FloatArray:

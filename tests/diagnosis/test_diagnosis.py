@@ -36,6 +36,7 @@ from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.mask_shift import contour_profiles, mask_shift
 from sst_graph.inspect.reasons import short_reason
+from sst_graph.metrics import FORWARD_R_OPTICAL
 from sst_graph.odometry.sweep import SweepDecision, SweptSource, with_sweep
 from sst_graph.result import FrameId, Status
 from sst_graph.simulator import SimulationConfig
@@ -613,6 +614,14 @@ def test_angles_in_the_wrong_unit(degrees: bool, words: str, sequence: str) -> N
     true = CTL.retract(np.array([0.01, -0.015, 0.01, 0.0, 0.0, 0.0]))
     found = wrong_start(gtsam.Pose3(misread, CTL.translation()), LabelFit(true, 0.0, 0.6, 0.8))
     assert found is not None and words in found.cause
+
+
+def test_the_start_of_a_camera_link() -> None:
+    """It is near the identity, as are a rig's angles in radians that were taken as degrees."""
+    link = gtsam.Pose3(FORWARD_R_OPTICAL, np.zeros(3)) * CTL
+    for step in (np.zeros(6), np.array([0.01, -0.015, 0.01, 0.0, 0.0, 0.0])):
+        found = wrong_start(link, LabelFit(CTL.retract(step), 0.0, 0.6, 0.8))
+        assert found is not None and "that of the camera's link" in found.cause
 
 
 def test_a_start_is_wrong_where_both_halves_of_the_drive_agree_elsewhere() -> None:

@@ -9,6 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,10 +19,11 @@ from sst_graph.data.arrays import listed
 from sst_graph.data.rectified import RectifiedSource
 from sst_graph.data.ros.bag import Bag, Topic
 from sst_graph.data.ros.camera_info import ImageGeometry, geometry_by_file, has_matrix, image_geometry
-from sst_graph.data.ros.clouds import field_names
+from sst_graph.data.ros.clouds import cloud_of, field_names
 from sst_graph.data.ros.frames import CloudReading, check_size, mask_classes, scan_of
 from sst_graph.data.ros.images import mask_of, picture_of
 from sst_graph.data.ros.index import BagIndex, Stamped, read_index
+from sst_graph.data.ros.link_frame import LINK_AXES, is_link, of_optical_axes
 from sst_graph.data.ros.topics import Topics, choose_topics
 from sst_graph.data.source import Loader, SourceOptions
 from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
@@ -151,7 +153,7 @@ def open_ros(path: Path, options: SourceOptions) -> Source:
     _check_masks(bag, index)
     size = _size(bag, topics, index)
     geometry = _geometry(path, topics, index, size, options)
-    oTl, reason = index.transforms.pose(index.image_frame, index.cloud_frame)
+    oTl, reason = _extrinsic(bag, topics, index, geometry)
     nominal = None if oTl is None else geometry.extrinsic(oTl)
     if nominal is None:
         _LOG.info("%s: no nominal extrinsic: %s", printable(path), reason)
@@ -208,6 +210,21 @@ def _geometry(
         expected = "a calibrated one, or its file (--camera-file)"
         raise DataError(place, "K = 0, an uncalibrated camera", expected)
     return image_geometry(index.info, topics.image.name, size, place)
+
+
+def _extrinsic(
+    bag: Bag, topics: Topics, index: BagIndex, geometry: ImageGeometry
+) -> tuple[gtsam.Pose3 | None, str]:
+    """Pose of the LiDAR in the optical axes of the camera by the transforms, or None, and why."""
+    oTl, reason = index.transforms.pose(index.image_frame, index.cloud_frame)
+    if oTl is None:
+        return None, reason
+    first, frame = index.clouds[0], index.image_frame
+    message = _read(bag, topics, index, first, topics.cloud.type)
+    points = cloud_of(message, first.stamp_ns, _place(bag, first), times=False).points
+    if not is_link(frame, oTl, points, geometry.model):
+        return oTl, reason
+    return of_optical_axes(oTl), f"{reason}; {frame!r} shows to be the camera's link ({LINK_AXES})"
 
 
 def _size(bag: Bag, topics: Topics, index: BagIndex) -> tuple[int, int]:

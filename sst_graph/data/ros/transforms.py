@@ -12,6 +12,8 @@ import numpy as np
 
 _ROUNDED = 2e-2
 """Most that the length of a quaternion may be off 1, as in one that was typed by hand (0.7 0 0 0.7)."""
+_LISTED = 12
+"""Frames that a message lists at most."""
 _SAME = 1e-6
 """Transforms that differ by less [m, and in the elements of the rotation] are the same."""
 
@@ -89,7 +91,7 @@ class Transforms:
             return None, f"camera and LiDAR have the same frame, {parent!r}"
         path = self._path(parent, child)
         if path is None:
-            return None, f"no chain of transforms from {parent!r} to {child!r}"
+            return None, f"no chain of transforms from {parent!r} to {child!r}{self._unknown(parent, child)}"
         pose = gtsam.Pose3()
         for first, second in pairwise(path):
             edge = (first, second) if (first, second) in self._poses else (second, first)
@@ -111,6 +113,15 @@ class Transforms:
         kept._moving = {edge for edge in self._moving if edge in kept._poses}
         kept._wrong = {edge: wrong for edge, wrong in self._wrong.items() if edge in kept._poses}
         return kept
+
+    def _unknown(self, *frames: str) -> str:
+        """Which of some frames no transform has, and which frames there are, in words."""
+        names = self.frames
+        missing = [frame for frame in frames if frame not in names]
+        if not missing or not names:
+            return ""
+        some = ", ".join(names[:_LISTED]) + ", ..." * (len(names) > _LISTED)
+        return f"; {' and '.join(map(repr, missing))} not among {some}"
 
     def _path(self, start: str, end: str) -> list[str] | None:
         """The shortest chain of frames."""

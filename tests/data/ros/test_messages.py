@@ -379,6 +379,12 @@ def test_a_chain_of_transforms_gives_the_pose_of_the_lidar_in_the_camera() -> No
     assert words == f"by transforms {CAMERA_FRAME} - base_link - mast - {LIDAR_FRAME}"
 
 
+def test_a_frame_that_no_transform_has_is_named_with_those_that_there_are() -> None:
+    pose, words = transforms(MAKE.transforms(chain(CTL))).pose("usb_cam", LIDAR_FRAME)
+    assert pose is None
+    assert words.endswith(f"; 'usb_cam' not among base_link, {CAMERA_FRAME}, mast, {LIDAR_FRAME}")
+
+
 def _with_quaternion(message: Any, xyzw: Sequence[float], x: float = 0.0) -> Any:
     """A TFMessage whose last transform has this quaternion, and this translation along x."""
     *others, last = message.transforms

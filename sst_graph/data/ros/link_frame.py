@@ -1,0 +1,49 @@
+"""The axes of the frame that images are stamped with.
+
+REP 103 has the optical ones: x right, y down, z forward. Many drivers stamp images with the camera's link: x
+forward, y left, z up. By the axes of a link a level camera looks at the sky, and the LiDAR measures nothing
+there.
+"""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.cameras import CameraModel
+from sst_graph.metrics import FORWARD_R_OPTICAL
+
+LINK_AXES = "x forward, y left, z up"
+_UPWARD = np.cos(np.radians(45.0))
+"""Least cosine between the LiDAR's z axis, or its opposite, and the z axis of a level camera's link."""
+_LEAST_SEEN, _TIMES_MORE = 50, 20.0
+"""Fewest points in the image by the axes of a link, and how many times more they are than by optical axes."""
+
+
+def is_link(name: str, oTl: gtsam.Pose3, points: NDArray[np.float32], model: CameraModel) -> bool:
+    """Whether the frame of the images shows to be the camera's link.
+
+    Args:
+        name: of the frame; one that says "optical" is believed.
+        oTl: pose of the LiDAR in it.
+        points: (n, 3) of a scan, frame of the LiDAR [m].
+        model: of the camera that took the images.
+    """
+    if "optical" in name.lower() or abs(float(oTl.rotation().matrix()[2, 2])) < _UPWARD:
+        return False
+    by_link = _seen(of_optical_axes(oTl), points, model)
+    return by_link >= _LEAST_SEEN and by_link > _TIMES_MORE * _seen(oTl, points, model)
+
+
+def of_optical_axes(linkTl: gtsam.Pose3) -> gtsam.Pose3:
+    """Pose of the LiDAR in the optical axes of a camera, from that in its link."""
+    return gtsam.Pose3(FORWARD_R_OPTICAL.inverse(), np.zeros(3)) * linkTl
+
+
+def _seen(cTl: gtsam.Pose3, points: NDArray[np.float32], model: CameraModel) -> int:
+    """Number of points in the image."""
+    uvs, valid = model.project(cTl.transformFrom(points.T.astype(np.float64)).T)
+    with np.errstate(invalid="ignore"):
+        inside = (uvs >= -0.5) & (uvs < np.array([model.width, model.height]) - 0.5)
+    return int(np.count_nonzero(valid & inside.all(axis=1)))
