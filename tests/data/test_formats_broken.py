@@ -281,6 +281,19 @@ def test_stamps_in_a_table_and_files_that_are_not_in_it(folder: Path) -> None:
     assert stamps == [7_000_000, 57_000_000, 107_000_000]
 
 
+def test_lines_whose_files_are_missing_are_left_out_and_counted(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    names = sorted(path.name for path in (folder / "images").iterdir())[:3]
+    rows = [(f"cam0/{Path(name).stem}", 7_000_000 + 50_000_000 * k) for k, name in enumerate(names)]
+    lines = [f"{ns},{name}" for name, ns in rows] + ["157000000,lost.png", "lost_too.png,207000000"]
+    (folder / "images.csv").write_text("\n".join(lines) + "\n")
+    source = open_source(folder)
+    stamps = [frame.image.stamp_ns for frame in source if frame.image is not None]
+    assert stamps == [7_000_000, 57_000_000, 107_000_000]
+    assert "2 lines of images.csv left out, whose files are missing" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("heading", "line"),
     [

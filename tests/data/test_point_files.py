@@ -97,6 +97,25 @@ def test_numpy_files(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_cloud(tmp_path / "b.npz").points(), points[:, :3])
 
 
+@pytest.mark.parametrize("shape", [(6, 5), (2, 3, 4), (2, 3, 9)])
+def test_arrays_with_more_values_a_point_or_in_rows_and_columns(
+    tmp_path: Path, shape: tuple[int, ...]
+) -> None:
+    values = np.arange(np.prod(shape), dtype=np.float64).reshape(shape)
+    table = values.reshape(6, -1)
+    np.save(tmp_path / "a.npy", values)
+    np.savez(tmp_path / "a.npz", cloud=values, ring=np.arange(6))
+    for name in ("a.npy", "a.npz"):
+        cloud = read_cloud(tmp_path / name)
+        np.testing.assert_array_equal(cloud.points(), table[:, :3])
+        np.testing.assert_array_equal(cloud.intensities(), table[:, 3])
+    assert cloud.rings() is not None
+    records = np.zeros((2, 3), [(axis, "<f4") for axis in "xyz"])
+    records["y"] = np.arange(6).reshape(2, 3)
+    np.save(tmp_path / "b.npy", records)
+    assert read_cloud(tmp_path / "b.npy").points()[:, 1].tolist() == [0, 1, 2, 3, 4, 5]
+
+
 def test_fields_as_cloudcompare_names_them(tmp_path: Path) -> None:
     values = records()
     names = {name: name if name in "xyz" else f"scalar_{name.capitalize()}" for name in DTYPE.names or ()}
@@ -212,7 +231,7 @@ BROKEN = {
     "objects.npy": (npy((1,), bytes(8), "|O"), "an array of object"),
     "many.npy": (npy((MANY, 3), TWELVE), "12 bytes behind the header"),
     "short.npy": (npy((2, 3), TWELVE), "12 bytes behind the header"),
-    "wide.npy": (npy((1, 7), bytes(28)), r"an array of shape \(1, 7\)"),
+    "wide.npy": (npy((1, 17), bytes(68)), r"an array of shape \(1, 17\)"),
     "negative.npy": (npy((-1, 3), TWELVE), "behind the header|no .npy file"),
     "a.npz": (b"PK\3\4 no zip", "no .npz file"),
     "a.pcd": (b"x y z\n1 2 3\n", "no line DATA"),

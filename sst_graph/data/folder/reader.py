@@ -113,6 +113,9 @@ def open_folder(path: Path, options: SourceOptions) -> Source:
         if files.without_stamp:
             found = count_of(files.without_stamp, what.removesuffix("s"))
             _LOG.warning("%s: %s without a stamp left out", printable(path), found)
+        if files.without_file:
+            found = f"{count_of(files.without_file, 'line')} of {what}.csv"
+            _LOG.warning("%s: %s left out, whose files are missing", printable(path), found)
     model = read_camera(own / _CAMERA, "" if own == path else options.camera)
     extrinsic = own / _EXTRINSIC
     nominal = read_extrinsic(extrinsic) if os.path.lexists(extrinsic) else None

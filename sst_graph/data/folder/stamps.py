@@ -1,14 +1,16 @@
 """Stamps of files: in a CSV file beside them, or as their names.
 
 ``images.csv`` beside ``images/``: one "name,stamp" a line, or "stamp,name" (EuRoC), quotes or none; a first
-line of words is a heading; a file without a line is left out. A stamp, here or as a name, is seconds with a
-decimal point ("1317048145.963.png"), or whole nanoseconds ("1317048145963000000.png").
+line of words is a heading. A file without a line is left out, and so is a line whose file is missing. Names
+may have a path before them, or lack their ending. A stamp, here or as a name, is seconds with a decimal point
+("1317048145.963.png"), or whole nanoseconds ("1317048145963000000.png").
 """
 
 from __future__ import annotations
 
 import csv
 import re
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,11 +42,13 @@ class StampedFiles:
         stamps_ns: (n,) rising strictly [ns].
         paths: (n,) files.
         without_stamp: number of files that are left out because the CSV file does not name them.
+        without_file: number of lines of the CSV file that name no file.
     """
 
     stamps_ns: NDArray[np.int64]
     paths: tuple[Path, ...]
     without_stamp: int = 0
+    without_file: int = 0
 
 
 def stamped_files(folder: Path, suffixes: tuple[str, ...]) -> StampedFiles:
@@ -55,7 +59,7 @@ def stamped_files(folder: Path, suffixes: tuple[str, ...]) -> StampedFiles:
 
     Raises:
         DataError: no file, a name that is no stamp and no CSV file, stamps that are equal, a line of the CSV
-            file that names no file or no stamp.
+            file without a stamp, or none that names a file.
     """
     entries = listed(folder, f"files {', '.join('*' + suffix for suffix in suffixes)}")
     # Hidden files are no data: macOS puts "._NAME" beside NAME on foreign disks.
@@ -64,8 +68,9 @@ def stamped_files(folder: Path, suffixes: tuple[str, ...]) -> StampedFiles:
     if not files:
         raise DataError(folder, "no such file", f"files {', '.join('*' + suffix for suffix in suffixes)}")
     table = folder.with_name(f"{folder.name}.csv")
+    without_file = 0
     if table.exists():
-        stamps = _table(table, files)
+        stamps, without_file = _table(table, files)
     else:
         stamps = {name: _stamp_of(path, table) for name, path in files.items()}
     names = sorted(stamps, key=lambda name: stamps[name])
@@ -76,7 +81,8 @@ def stamped_files(folder: Path, suffixes: tuple[str, ...]) -> StampedFiles:
         found = f"stamps with a median step of {step:g} ns"
         expected = "stamps in seconds with a decimal point or in whole nanoseconds"
         raise DataError(table if table.exists() else folder, found, expected)
-    return StampedFiles(stamps_ns, tuple(files[name] for name in names), len(files) - len(names))
+    paths = tuple(files[name] for name in names)
+    return StampedFiles(stamps_ns, paths, len(files) - len(names), without_file)
 
 
 def _stamp_of(path: Path, table: Path) -> int:
@@ -95,36 +101,63 @@ def _stamp(word: str, place: str | Path) -> int | None:
     return checked_ns(int(word), place) if _WHOLE.fullmatch(word) else None
 
 
-def _table(table: Path, files: Mapping[str, Path]) -> dict[str, int]:
-    """Stamps by name."""
+def _table(table: Path, files: Mapping[str, Path]) -> tuple[dict[str, int], int]:
+    """Stamps by name, and the number of lines whose file is missing."""
     text = read_text(table, STAMPS_CSV)
     if text.count("\n") > MAX_STAMPS:
         raise DataError(table, count_of(text.count(chr(10)), "line"), f"at most {MAX_STAMPS} stamps")
     stamps: dict[str, int] = {}
+    missing: list[tuple[str, str]] = []
+    known = _by_any_name(files)
     for number, line in enumerate(text.splitlines(), 1):
         words = _words(line)
         place = f"{table}:{number}"
-        if not any(words) or (number == 1 and _is_heading(words, files)):
+        if not any(words) or (number == 1 and _is_heading(words, known)):
             continue
-        if len(words) != 2:
+        entry = _entry(words, known, place)
+        if entry is None:
             raise DataError(place, f"{line!r:.80}", _LINE)
-        # A file may be called by a number, too: 000000 or its stamp.
-        name, word = words if words[0] in files or words[1] not in files else reversed(words)
-        if (stamp := _stamp(word, place)) is None:
-            raise DataError(place, f"{line!r:.80}", _LINE)
-        if name not in files:
-            raise DataError(place, f"{name!r:.80}", f"the name of a file in {table.stem}")
-        if name in stamps:
+        word, stamp = entry
+        name = known.get(_last_part(word))
+        if name is None:
+            missing.append((place, word))
+        elif name in stamps:
             raise DataError(place, f"{name!r:.80} again", "each file once")
-        stamps[name] = stamp
+        else:
+            stamps[name] = stamp
+    if missing and not stamps:
+        place, word = missing[0]
+        raise DataError(place, f"{word!r:.80}", f"the name of a file in {table.stem}")
     if not stamps:
         raise DataError(table, "no stamp", "one name,stamp a line")
-    return stamps
+    return stamps, len(missing)
 
 
-def _is_heading(words: list[str], files: Mapping[str, Path]) -> bool:
+def _by_any_name(files: Mapping[str, Path]) -> dict[str, str]:
+    """Names of files by themselves, and without the ending where one file alone is called so."""
+    stems = Counter(path.stem for path in files.values())
+    return {path.stem: name for name, path in files.items() if stems[path.stem] == 1} | {n: n for n in files}
+
+
+def _last_part(word: str) -> str:
+    """The name of a file without the path before it, of any system."""
+    return re.split(r"[/\\]", word)[-1]
+
+
+def _entry(words: list[str], known: Mapping[str, str], place: str) -> tuple[str, int] | None:
+    """Name and stamp [ns] of a line, or None where it has another content."""
+    if len(words) != 2:
+        return None
+    # A file may be called by a number, too: 000000 or its stamp.
+    for name, word in sorted((words, words[::-1]), key=lambda pair: _last_part(pair[0]) not in known):
+        if (stamp := _stamp(word, place)) is not None:
+            return name, stamp
+    return None
+
+
+def _is_heading(words: list[str], known: Mapping[str, str]) -> bool:
     """Whether a line names neither a file nor a number: "name,stamp_ns", "#timestamp [ns],filename"."""
-    return len(words) == 2 and not any(word in files or _NUMBER.match(word) for word in words)
+    return len(words) == 2 and not any(word in known or _NUMBER.match(word) for word in words)
 
 
 def _words(line: str) -> list[str]:

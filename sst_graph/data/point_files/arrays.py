@@ -1,13 +1,15 @@
 """Clouds in files of plain arrays: KITTI's .bin, NumPy's .npy and .npz.
 
-A .npy is a structured array with fields x, y, z, ..., or an array (n, 3) or (n, 4) of x y z and intensity.
-A .npz has one array a field, or such an array, the only one of two dimensions or named ``points``, beside
-fields of their own. Nothing is unpickled.
+A .npy is a structured array with fields x, y, z, ..., or an array (n, 3) of x y z, which intensity and more
+may follow; an organized cloud has rows and columns in the place of n. A .npz has one array a field, or such
+an array, the only one of two or three dimensions or named ``points``, beside fields of their own. Nothing is
+unpickled.
 """
 
 from __future__ import annotations
 
 import io
+import math
 import tokenize
 import zipfile
 import zlib
@@ -32,6 +34,8 @@ _MAX_BYTES = 512 * 1024 * 1024
 """Of one array, unpacked."""
 _MAX_HEADER = 10_000
 _COLUMNS = ("x", "y", "z", "intensity")
+_MAX_COLUMNS = 16
+"""Most values a point of an array without names; of more, rows are taken for columns."""
 _BROKEN = (
     ValueError,
     EOFError,
@@ -87,7 +91,7 @@ def read_npz(data: bytes, path: Path) -> PointFields:
                 arrays[member.filename.removesuffix(".npy")] = _array(content, path)
     except (*_BROKEN, RuntimeError) as error:
         raise DataError(path, f"no .npz file ({first_line(error)})", "arrays that NumPy wrote") from None
-    tables = [name for name, array in arrays.items() if array.ndim == 2]
+    tables = [name for name, array in arrays.items() if array.ndim > 1]
     alone = len(tables) == 1 and "x" not in {name.lower() for name in arrays}
     for name, array in arrays.items():
         is_table = name == "points" or (alone and name in tables)
@@ -115,14 +119,14 @@ def _array(data: bytes, path: Path) -> NDArray[Any]:
         or dtype.hasobject
         or dtype.itemsize == 0
         or dtype.itemsize > MAX_POINT_BYTES
-        or len(shape) not in (1, 2)
+        or len(shape) not in (1, 2, 3)
     ):
         raise DataError(path, f"an array of {dtype}, shape {shape}", "numbers or structured records")
     count = 1
     for length in shape:
         count *= int(length)
     rest = len(data) - stream.tell()
-    if min(shape) < 0 or shape[0] > MAX_POINTS or count * dtype.itemsize != rest:
+    if min(shape) < 0 or math.prod(shape[:-1] or shape) > MAX_POINTS or count * dtype.itemsize != rest:
         raise DataError(
             path, f"{count_of(rest, 'byte')} behind the header", f"those of an array of shape {shape}"
         )
@@ -131,11 +135,14 @@ def _array(data: bytes, path: Path) -> NDArray[Any]:
 
 
 def _fields(array: NDArray[Any], path: Path) -> dict[str, NDArray[Any]]:
-    check_count(path, len(array))
     if array.dtype.names is not None:
-        if array.ndim != 1:
-            raise DataError(path, f"records of shape {array.shape}", "(n,)")
+        array = array.reshape(-1)
+        check_count(path, len(array))
         return structured_fields(array)
-    if array.ndim != 2 or array.shape[1] not in (3, 4):
-        raise DataError(path, f"an array of shape {array.shape}", "(n, 3) or (n, 4), or records with x, y, z")
-    return {name: array[:, k] for k, name in enumerate(_COLUMNS[: array.shape[1]])}
+    if array.ndim < 2 or not 3 <= array.shape[-1] <= _MAX_COLUMNS:
+        expected = f"(n, 3) to (n, {_MAX_COLUMNS}), or records with x, y, z"
+        raise DataError(path, f"an array of shape {array.shape}", expected)
+    table = array.reshape(-1, array.shape[-1])
+    check_count(path, len(table))
+    # Nothing says what is behind the intensity.
+    return {name: table[:, k] for k, name in enumerate(_COLUMNS[: table.shape[1]])}
