@@ -89,7 +89,8 @@ def camera_from_camera_info(
             for the camera's rectified frame.
 
     Raises:
-        DataError: an uncalibrated camera, binning or a region of interest, another distortion model.
+        DataError: an uncalibrated camera, another distortion model; binning or a region of interest, for
+            which :func:`camera_info_of_size` gives the table to be read.
     """
     check_full_sensor(info, place)
     width, height = (_whole(info, key, place) for key in ("width", "height"))
@@ -106,6 +107,39 @@ def camera_from_camera_info(
     return camera_of(_pinhole(K, width, height, f"{place}: K"), distortion, D, place)
 
 
+def camera_info_of_size(info: Table, size: tuple[int, int], place: str | Path) -> dict[str, Any]:
+    """The ``CameraInfo`` of images of ``size``, which may be a region of the sensor, binned.
+
+    Where ``info`` has another size, its K and P are those of the full sensor; they become those of the images
+    as in ROS's image_geometry: u = (u_full - x_offset) / binning_x. Where ``info`` has no size, or that of
+    the images, K and P are theirs.
+
+    Raises:
+        DataError: the images have none of these sizes.
+    """
+    full = _member(info, "width"), _member(info, "height")
+    if full == (0, 0):
+        check_full_sensor(info, place)
+    table = dict(info) | {"width": size[0], "height": size[1], "binning_x": 0, "binning_y": 0, "roi": None}
+    if full in ((0, 0), size):
+        return table
+    roi, binning = info.get("roi"), [max(1, _member(info, f"binning_{axis}")) for axis in "xy"]
+    region = _member(roi, "width") or full[0], _member(roi, "height") or full[1]
+    corner = _member(roi, "x_offset"), _member(roi, "y_offset")
+    if (region[0] // binning[0], region[1] // binning[1]) != size:
+        part = f", a region of {region[0]}x{region[1]} px" if region != full else ""
+        binned = f", binned {binning[0]}x{binning[1]}" if max(binning) > 1 else ""
+        expected = f"{size[0]}x{size[1]} px, the size of the images"
+        raise DataError(place, f"{full[0]}x{full[1]} px{part}{binned}", expected)
+    scale = np.diag([1.0 / binning[0], 1.0 / binning[1], 1.0])
+    scale[:2, 2] = -np.array(corner) / binning
+    for name, columns in (("K", 3), ("P", 4)):
+        key = name if name in table else name.lower()
+        matrix = _matrix(_either(table, name, name.lower(), place), (3, columns), f"{place}: {name}")
+        table[key] = (scale @ matrix).ravel()
+    return table
+
+
 def check_full_sensor(info: Table, place: str | Path) -> None:
     """Refuse a ``CameraInfo`` of images that are binned, or of a part of the sensor.
 
@@ -114,7 +148,7 @@ def check_full_sensor(info: Table, place: str | Path) -> None:
     """
     width, height, roi = _member(info, "width"), _member(info, "height"), info.get("roi")
     region = {key: _member(roi, key) for key in ("x_offset", "y_offset", "width", "height")}
-    binned = max(int(info.get("binning_x", 0)), int(info.get("binning_y", 0))) > 1
+    binned = max(_member(info, "binning_x"), _member(info, "binning_y")) > 1
     cut = region["width"] not in (0, width) or region["height"] not in (0, height)
     if binned or cut or region["x_offset"] or region["y_offset"]:
         raise DataError(place, "binning or a region of interest", "images of the full sensor")

@@ -313,7 +313,7 @@ def test_a_camera_info_of_another_camera_is_warned_of(bag: Any, config: TrackerC
             f"{number} CameraInfo of another camera than the first, whose model is used: "
             "restart the node if the camera changed"
         )
-    wrong = ({"p": np.full(12, np.nan)}, {"k": np.zeros(9)}, {"binning_x": 2})
+    wrong = ({"p": np.full(12, np.nan)}, {"k": np.zeros(9)}, {"width": 0, "height": 0, "binning_x": 2})
     for number, (change, words) in enumerate(zip(wrong, ("P", "K = 0", "binning"), strict=True), 1):
         node.add_info(dataclasses.replace(info, **change), now_ns)
         camera = _diagnostics(node, now_ns)["camera"]

@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 
 from sst_graph.cameras import CameraModel
-from sst_graph.cameras.readers import camera_from_camera_info, check_full_sensor
+from sst_graph.cameras.readers import camera_from_camera_info, camera_info_of_size
 from sst_graph.data.folder.camera_file import read_camera
 from sst_graph.errors import DataError
 from sst_graph.files.checked_values import checked_pose
@@ -84,18 +84,12 @@ def image_geometry(message: Any, image_topic: str, size: Size, place: str) -> Im
 
     Images of a topic with a word that begins with "rect" in its name, as image_proc writes them, have the
     intrinsics of P and the rotation R; all others have those of K and the distortion D. Where P is left at
-    zero and nothing is distorted K holds for either.
+    zero and nothing is distorted K holds for either. Images may be a region of the sensor, or binned.
 
     Raises:
         DataError: no calibration, one of another size, or an unknown distortion.
     """
-    table = dict(vars(message))
-    check_full_sensor(table, place)
-    calibrated = int(table["width"]), int(table["height"])
-    if calibrated not in ((0, 0), size):
-        expected = f"{size[0]}x{size[1]} px, the size of the images"
-        raise DataError(place, f"{calibrated[0]}x{calibrated[1]} px", expected)
-    table |= {"width": size[0], "height": size[1]}
+    table = camera_info_of_size(vars(message), size, place)
     D, P = (table[name] if name in table else table[name.lower()] for name in "DP")
     rectified = _RECTIFIED.search(image_topic) is not None and bool(np.any(P) or np.any(D))
     if not len(D):

@@ -130,7 +130,11 @@ def _only_bag(path: Path) -> Path:
     files = _bag_files(path)
     if len(files) > 1:
         some = ", ".join(file.name for file in files[:4]) + (", ..." if len(files) > 4 else "")
-        expected = f"{_METADATA} beside them ('ros2 bag reindex' writes it), or one of them as DATA"
+        joined = f"{_METADATA} beside them ('ros2 bag reindex' writes it)"
+        if all(file.suffix == ".bag" for file in files):
+            command = f"rosbags-convert --src {path}/*.bag --dst DRIVE"
+            joined = f"one bag ({command!r} joins the parts of one drive)"
+        expected = f"{joined}, or one of them as DATA"
         raise DataError(path, f"{count_of(len(files), 'bag')} ({some}) without {_METADATA}", expected)
     return files[0]
 

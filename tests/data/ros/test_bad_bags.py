@@ -290,6 +290,16 @@ def test_a_folder_whose_recording_was_ended_before_its_metadata(
     assert "found 2 bags (drive" in found and "'ros2 bag reindex' writes it" in found
 
 
+def test_the_parts_of_a_ros1_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """ROS 1 keeps no list of them; the package that reads bags puts them together."""
+    for k in range(2):
+        with writing(tmp_path / f"drive_{k}.bag", "ros1") as bag:
+            fill(bag)
+    found = refused(capsys, tmp_path)
+    assert "found 2 bags (drive_0.bag, drive_1.bag)" in found and "ros2" not in found
+    assert f"'rosbags-convert --src {tmp_path}/*.bag --dst DRIVE' joins the parts of one drive" in found
+
+
 @pytest.mark.parametrize("text", ["", "rosbag2_bagfile_information:\n", "rosbag2_bagfile_information: 3\n"])
 def test_a_folder_whose_metadata_lacks_entries(
     text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

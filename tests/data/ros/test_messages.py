@@ -320,12 +320,39 @@ def test_images_are_rectified_by_a_word_of_their_topic(topic: str, rectified: bo
     assert (found.fx == 650.0) == rectified
 
 
-def test_binning_is_named_before_the_size_that_follows_from_it() -> None:
-    info = MAKE.info(CAMERA, binning_x=2, binning_y=2)
-    with pytest.raises(
-        DataError, match="binning or a region of interest, expected images of the full sensor"
+def region(x: int, y: int, width: int, height: int) -> Any:
+    offsets = {"x_offset": x, "y_offset": y, "width": width, "height": height}
+    return MAKE.make("sensor_msgs/msg/RegionOfInterest", **offsets, do_rectify=False)
+
+
+@pytest.mark.parametrize("topic", ["/cam/image_raw", "/cam/image_rect"])
+def test_images_of_a_part_of_the_sensor_and_binned_ones(topic: str) -> None:
+    """A direction falls on u = (u_full - x_offset) / binning_x."""
+    full = MAKE.info(CAMERA, d=np.array([-0.1, 0.01, 0.0, 0.0, 0.0]) * (topic == "/cam/image_raw"))
+    rays = np.array([[0.1, -0.05, 1.0], [-0.2, 0.1, 1.0], [0.0, 0.0, 1.0]])
+    whole, _ = image_geometry(full, topic, (640, 360), "here").model.project(rays)
+    for changes, size, corner, binning in (
+        ({"binning_x": 2, "binning_y": 2}, (320, 180), (0, 0), (2, 2)),
+        ({"roi": region(40, 100, 500, 200)}, (500, 200), (40, 100), (1, 1)),
+        ({"roi": region(41, 100, 500, 201), "binning_x": 4, "binning_y": 2}, (125, 100), (41, 100), (4, 2)),
+        ({"roi": region(0, 0, 640, 360)}, (640, 360), (0, 0), (1, 1)),
+        # Drivers that give the calibration of the binned images say the binning, too.
+        ({"binning_x": 2, "binning_y": 2}, (640, 360), (0, 0), (1, 1)),
     ):
+        model = image_geometry(replace(full, **changes), topic, size, "here").model
+        assert (model.width, model.height) == size
+        uvs, valid = model.project(rays)
+        assert valid.all()
+        np.testing.assert_allclose(uvs, (whole - corner) / binning, atol=1e-9)
+
+
+def test_images_of_another_size_than_the_region_binned() -> None:
+    info = MAKE.info(CAMERA, binning_x=2, binning_y=2, roi=region(0, 0, 600, 300))
+    expected = "640x360 px, a region of 600x300 px, binned 2x2, expected 320x180 px, the size of the images"
+    with pytest.raises(DataError, match=expected):
         image_geometry(info, "/cam/image_raw", (320, 180), "here")
+    with pytest.raises(DataError, match="binning or a region of interest, expected images of the full"):
+        image_geometry(replace(info, width=0, height=0), "/cam/image_raw", (320, 180), "here")
 
 
 def test_a_mask_of_inexact_numbers_is_refused() -> None:
@@ -359,8 +386,6 @@ def test_cameras_that_cannot_be_used() -> None:
     for D in (np.zeros(5), np.zeros(0)):
         found = image_geometry(replace(only_K, d=D), "/cam/image_rect", (640, 360), "here").model
         assert found == BrownConradyCamera(CAMERA)
-    with pytest.raises(DataError, match="binning"):
-        image_geometry(MAKE.info(CAMERA, binning_x=2), "/cam/image_raw", (640, 360), "here")
 
 
 CTL = gtsam.Pose3(gtsam.Rot3.Ypr(0.3, -0.2, 1.0), np.array([0.1, -0.3, 0.2]))
