@@ -34,6 +34,8 @@ def parse_yaml(text: str, place: str | Path) -> dict[str, Any]:
 
     if text.startswith("%YAML:"):  # OpenCV's first line is no directive of YAML
         text = text.partition("\n")[2]
+    # What "ros2 topic echo --once" prints ends with the beginning of another document.
+    text = text.rstrip().removesuffix("\n---") + "\n"
 
     class Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
         """Numbers, text, lists and tables of distinct names, and OpenCV's matrices."""

@@ -219,6 +219,9 @@ CAMERAS = {
     "   cols: 3\n   dt: d\n   data: [ 700., 0., 4., 0., 701., 3., 0., 0., 1. ]\n"
     "distortion_coefficients: !!opencv-matrix\n   rows: 1\n   cols: 4\n   dt: d\n"
     "   data: [ 0., 0., 0., 0. ]\n",
+    "script": "resolution: [8, 6]\nmtx: [[700, 0, 4], [0, 701, 3], [0, 0, 1]]\ndist_coeffs: [0, 0, 0, 0]\n",
+    "camera_info": "header: {frame_id: camera}\nheight: 6\nwidth: 8\ndistortion_model: plumb_bob\n"
+    "d: [0, 0, 0, 0]\nk: [700, 0, 4, 0, 701, 3, 0, 0, 1]\nbinning_x: 0\nroi: {width: 0}\n---\n",
     "plain": "fx: 700\nfy: 7.01e2\ncx: 4\ncy: 3\nwidth: 8\nheight: 6\n",
 }
 
@@ -230,11 +233,26 @@ def test_cameras_of_other_tools(folder: Path, kind: str) -> None:
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (700.0, 701.0, 4.0, 3.0)
     assert (camera.width, camera.height) == (8, 6)
     (folder / "camera.yaml").write_text(CAMERAS[kind].replace("0, 0, 0, 0]", "-0.3, 0, 0, 0]"))
-    if kind == "kalibr":
+    if kind == "opencv":
+        (folder / "camera.yaml").write_text(CAMERAS[kind].replace("0., 0., 0., 0. ]", "-0.3, 0., 0., 0. ]"))
+    if kind != "plain":
         # Rectified as it is read: with so few pixels there is no pinhole to rectify to.
         assert read_camera(folder / "camera.yaml") == BrownConradyCamera(camera, (-0.3, 0.0, 0.0, 0.0))
         with pytest.raises(DataError, match=r"camera \(plumb_bob\): found a field of 8x6 px"):
             open_source(folder)
+
+
+def test_a_distortion_under_another_name_is_refused_and_not_passed_over(tmp_path: Path) -> None:
+    file, K = tmp_path / "camera.yaml", "K: [700, 0, 4, 0, 701, 3, 0, 0, 1]\nwidth: 8\nheight: 6\n"
+    file.write_text(f"{K}distorsion: [-0.3, 0, 0, 0]\n")
+    with pytest.raises(DataError, match="the key 'distorsion', expected distortion_coefficients"):
+        read_camera(file)
+    file.write_text(f"{K}D: [-0.3, 0, 0, 0]\ndist_coeffs: [0, 0, 0, 0]\n")
+    with pytest.raises(DataError, match="'dist_coeffs' beside another entry for distortion_coefficients"):
+        read_camera(file)
+    file.write_text(f"{K}binning_x: 2\n")
+    with pytest.raises(DataError, match="binning"):
+        read_camera(file)
 
 
 def test_a_camera_is_found_in_a_chain_by_its_name_or_topic(tmp_path: Path) -> None:

@@ -5,7 +5,8 @@ A camera is written in one of three ways:
 - plainly: fx, fy, cx, cy [px], width, height, and where the pictures are not rectified distortion_model and
   distortion;
 - as Kalibr's camchain: cam0 with camera_model, intrinsics, distortion_model, distortion_coeffs, resolution;
-- as OpenCV's or ROS's calibration: camera_matrix, image_width, image_height, distortion_coefficients.
+- as OpenCV's or ROS's calibration: camera_matrix, image_width, image_height, distortion_coefficients; or
+  the names that scripts and CameraInfo have for these, such as K, D, dist_coeffs, width, height, image_size.
 
 An extrinsic is ``T_camera_lidar`` (4x4), or ``translation`` [m] and ``quaternion`` in the order w x y z.
 """
@@ -21,7 +22,12 @@ import gtsam
 import numpy as np
 
 from sst_graph.cameras.model import CameraModel
-from sst_graph.cameras.readers import camera_from_opencv, camera_of, cameras_from_kalibr
+from sst_graph.cameras.readers import (
+    camera_from_opencv,
+    camera_of,
+    cameras_from_kalibr,
+    check_full_sensor,
+)
 from sst_graph.errors import DataError
 from sst_graph.files.checked_values import checked_pose, pinhole_camera
 from sst_graph.files.yaml_file import number, numbers, read_yaml
@@ -29,6 +35,18 @@ from sst_graph.files.yaml_file import number, numbers, read_yaml
 _EXPECTED = "fx, fy, cx, cy, width, height; or Kalibr's cam0; or OpenCV's camera_matrix"
 _IN_CHAIN = re.compile(r"cam\d+", re.ASCII)
 _PLAIN = ("fx", "fy", "cx", "cy", "width", "height", "distortion_model", "distortion")
+_OPENCV = {
+    "camera_matrix": ("cameramatrix", "k", "mtx"),
+    "distortion_coefficients": (
+        *("distortioncoefficients", "distortioncoeffs", "distortioncoeff", "distcoeffs", "distcoeff"),
+        *("distcoefs", "distortion", "dist", "d"),
+    ),
+    "image_width": ("imagewidth", "width"),
+    "image_height": ("imageheight", "height"),
+    "image_size": ("imagesize", "resolution"),
+}
+"""OpenCV's names, and others for the same in small letters without underscores."""
+_OF_DISTORTION = ("distortionmodel",)
 _ROUNDED = 1e-3
 """A quaternion's length differs from 1 by no more than its digits were rounded."""
 
@@ -57,11 +75,37 @@ def read_camera(path: Path, name: str = "") -> CameraModel:
     if any(isinstance(value, dict) for value in chain.values()):
         key = _of_chain(chain, name, path)
         return cameras_from_kalibr({key: {"camera_model": "pinhole", **chain[key]}}, path)[key].model
-    if "camera_matrix" in table or "K" in table:
-        if "D" not in table:
-            table.setdefault("distortion_coefficients", [])
-        return camera_from_opencv(table, path)
+    if any(_plain_key(key) in _OPENCV["camera_matrix"] for key in table):
+        calibration = _by_opencv_names(table, path)
+        check_full_sensor(calibration, path)
+        return camera_from_opencv({"distortion_coefficients": [], **calibration}, path)
     raise DataError(path, f"keys {', '.join(map(str, table))}"[:200], _EXPECTED)
+
+
+def _plain_key(key: object) -> str:
+    return str(key).lower().replace("_", "")
+
+
+def _by_opencv_names(table: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    """The table with OpenCV's names in the place of others for the same.
+
+    Raises:
+        DataError: two entries for the same, or one called distortion that is not understood: without it the
+            lens would pass for none.
+    """
+    named: dict[str, Any] = {}
+    for key, value in table.items():
+        plain = _plain_key(key)
+        name = next((name for name, others in _OPENCV.items() if plain in others), None)
+        if name is None and plain.startswith("dist") and plain not in _OF_DISTORTION:
+            raise DataError(path, f"the key {key!r:.60}", "distortion_coefficients, distortion_model")
+        if name in named:
+            raise DataError(path, f"{key!r:.60} beside another entry for {name}", "one of them")
+        named[str(key) if name is None else name] = value
+    if "image_size" in named:
+        width, height = numbers(named.pop("image_size"), f"{path} (image size)", 2)
+        named = {"image_width": width, "image_height": height} | named
+    return named
 
 
 def _of_chain(chain: Mapping[str, Any], name: str, path: Path) -> str:
