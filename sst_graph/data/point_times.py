@@ -10,6 +10,12 @@ from numpy.typing import NDArray
 FARTHEST_S = 1.0
 """Points are measured within this of the scan's stamp."""
 
+WITHOUT_TIMES = (
+    "(without them: --sweep clockwise or counterclockwise of a LiDAR that turns, compensated where its "
+    "points were moved to the stamp)"
+)
+"""How a cloud is read whose times cannot be used."""
+
 _SCAN_LASTS_S = (0.005, 0.5)
 """From a narrow part of a fast sweep to a slow one: less than 1000 times longer, so at most one unit fits."""
 _OF_FLOATS_NS = (1_000_000_000, 1_000_000, 1_000, 1)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.data.arrays import MAX_POINTS, check_metres
-from sst_graph.data.point_times import FARTHEST_S, seconds_after_stamp
+from sst_graph.data.point_times import FARTHEST_S, WITHOUT_TIMES, seconds_after_stamp
 from sst_graph.errors import DataError, count_of
 from sst_graph.files.reading import FileKind
 
@@ -95,7 +95,7 @@ class PointFields:
         if len(bad):
             times = count_of(len(bad), "time that is", "times that are")
             found = f"{times} NaN or beyond {FARTHEST_S:g} s, first at index {bad[0]}"
-            expected = "times within a second of the scan's stamp, absolute or after it"
+            expected = f"times within {FARTHEST_S:g} s of the scan's stamp {WITHOUT_TIMES}"
             raise DataError(self.path, found, expected)
         offsets_s = np.zeros(len(used), np.float32)
         offsets_s[kept] = seconds

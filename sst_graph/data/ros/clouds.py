@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sst_graph.data.arrays import MAX_POINTS
 from sst_graph.data.point_files.cloud import INTENSITIES, RINGS, TIMES
-from sst_graph.data.point_times import FARTHEST_S, seconds_after_stamp
+from sst_graph.data.point_times import FARTHEST_S, WITHOUT_TIMES, seconds_after_stamp
 from sst_graph.errors import DataError, count_of
 from sst_graph.validation import FARTHEST_M
 
@@ -151,7 +151,7 @@ def _offsets(table: NDArray[Any], stamp_ns: int, place: str) -> NDArray[np.float
     worst = float(np.abs(seconds).max())
     if not worst <= FARTHEST_S:
         found = f"field {name!r} with times up to {worst:.6g} s from the header's stamp"
-        expected = "times within 1 s of it (--sweep compensated reads the cloud without them)"
+        expected = f"times within {FARTHEST_S:g} s of it {WITHOUT_TIMES}"
         raise DataError(place, found, expected)
     return seconds.astype(np.float32)
 

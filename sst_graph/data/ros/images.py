@@ -20,6 +20,9 @@ _CHANNELS = {
 }  # fmt: skip
 """Bytes a pixel of each encoding (sensor_msgs/image_encodings.h)."""
 
+_OF_16_BITS = {f"{name.removesuffix('8')}16": name for name in _CHANNELS if name.endswith("8")}
+"""Encodings of 16 bits by those of 8, the upper ones, as which they are read; depths have 16UC1."""
+
 _TO_BGR = {
     "mono8": cv2.COLOR_GRAY2BGR,
     "8UC1": cv2.COLOR_GRAY2BGR,
@@ -53,7 +56,7 @@ def picture_of(message: Any, type_name: str, place: str) -> NDArray[np.uint8]:
         _check_compressed(message, place)
         return _demosaiced(decoded_picture(bytes(message.data), place), str(message.format))
     rows = _rows(message, place)
-    code = _TO_BGR.get(message.encoding)
+    code = _TO_BGR.get(_OF_16_BITS.get(message.encoding, message.encoding))
     if code is None:
         return np.ascontiguousarray(rows)
     try:
@@ -90,21 +93,25 @@ def mask_of(message: Any, type_name: str, place: str) -> NDArray[np.uint8]:
 def _rows(message: Any, place: str) -> NDArray[np.uint8]:
     """Pixels (h, w) or (h, w, channels) without the padding of the rows."""
     encoding, height, width = str(message.encoding), int(message.height), int(message.width)
-    if encoding not in _CHANNELS:
+    of_8_bits = _OF_16_BITS.get(encoding, encoding)
+    if of_8_bits not in _CHANNELS:
         hint = ", convert it to 8 bits" if "16" in encoding or "32" in encoding else ""
-        raise DataError(place, f"encoding {encoding!r}", f"one of {', '.join(_CHANNELS)}{hint}")
+        known = ", ".join((*_CHANNELS, *_OF_16_BITS))
+        raise DataError(place, f"encoding {encoding!r}", f"one of {known}{hint}")
     if min(height, width) < 1 or height * width > MAX_PIXELS:
         raise DataError(place, f"{width}x{height} px", f"1 to {MAX_PIXELS} pixels")
-    channels = _CHANNELS[encoding]
+    channels, each = _CHANNELS[of_8_bits], 1 if encoding == of_8_bits else 2
+    row = width * channels * each
     # Of a single row nothing follows, whatever its step says.
-    step = (height > 1 and int(message.step)) or width * channels
+    step = (height > 1 and int(message.step)) or row
     data = np.asarray(message.data, np.uint8)
-    if step < width * channels or len(data) < step * (height - 1) + width * channels:
+    if step < row or len(data) < step * (height - 1) + row:
         found = f"{count_of(len(data), 'byte')} in rows of {step}"
-        raise DataError(place, found, f"{width}x{height} px of {channels} bytes ({encoding})")
+        raise DataError(place, found, f"{width}x{height} px of {channels * each} bytes ({encoding})")
     padded = np.zeros(step * height, np.uint8)
     padded[: min(len(data), len(padded))] = data[: len(padded)]
-    rows = padded.reshape(height, step)[:, : width * channels]
+    upper = each - 1 if not message.is_bigendian else 0
+    rows = padded.reshape(height, step)[:, upper:row:each]
     return rows if channels == 1 else rows.reshape(height, width, channels)
 
 

@@ -103,10 +103,10 @@ def test_a_named_topic_that_is_not_there_or_of_another_type(
 
 def test_an_encoding_that_is_not_understood(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def deep(bag: BagWriter) -> None:
-        bag.add(IMAGE, bag.messages.image(EPOCH_NS, np.zeros((24, 64), np.uint8), "mono16"), EPOCH_NS)
+        bag.add(IMAGE, bag.messages.image(EPOCH_NS, np.zeros((24, 64), np.uint8), "16UC1"), EPOCH_NS)
 
     line = refused(capsys, made(tmp_path, lambda bag: fill(bag, [IMAGE]), deep))
-    assert "found encoding 'mono16', expected one of mono8" in line
+    assert "found encoding '16UC1', expected one of mono8" in line
 
 
 def test_fields_that_are_not_understood(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
