@@ -36,6 +36,39 @@ OF_ONE_DRIVE = ("sequence", "frames")
 """Options that belong to the drives of the result, not to any drive."""
 
 
+def given_cameras(args: argparse.Namespace) -> list[str]:
+    """Names after ``--camera``; what is a path there where DATA is not given is DATA.
+
+    Raises:
+        ConfigError: a camera is named twice, or DATA is missing.
+    """
+    names: list[str] = list(args.camera or ())
+    while not args.data and names and os.path.exists(names[-1]):
+        paths: list[Path] = []
+        while names and os.path.exists(names[-1]):
+            paths.insert(0, Path(names.pop()))
+        args.data = paths
+    if not args.data:
+        help_ = f"see 'sst-graph {args.command} --help'"
+        raise ConfigError(f"the following arguments are required: DATA ({help_})")
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise ConfigError(f"--camera {twice[0]}: found twice, expected each camera once")
+    return names
+
+
+def cameras_of_one_drive(args: argparse.Namespace) -> list[str | None]:
+    """Names after ``--camera``, or None for that of the data, of a command that takes one DATA.
+
+    Raises:
+        ConfigError: as :func:`given_cameras`, or several DATA.
+    """
+    names = given_cameras(args)
+    if len(args.data) > 1:
+        raise ConfigError(f"{args.command}: found {len(args.data)} DATA, expected one")
+    return [*names] or [None]
+
+
 def options_of(args: argparse.Namespace) -> dict[str, Any]:
     """How the command line says that its drives are to be read, defaults filled in; also in ``args``."""
     given = {name: value for name in SOURCE_DEFAULTS if (value := getattr(args, name, None)) is not None}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -36,26 +35,6 @@ from sst_graph.types import Source
 
 _PRINTED = ("status", "reasons", "covariance", "camera_poses", "known")
 """What ``--json`` prints of ``rig.json``."""
-
-
-def given_cameras(args: argparse.Namespace) -> list[str]:
-    """Names after ``--camera``; what is a path there where DATA is not given is DATA.
-
-    Raises:
-        ConfigError: a camera is named twice, or DATA is missing.
-    """
-    names: list[str] = list(args.camera or ())
-    while not args.data and names and os.path.exists(names[-1]):
-        paths: list[Path] = []
-        while names and os.path.exists(names[-1]):
-            paths.insert(0, Path(names.pop()))
-        args.data = paths
-    if not args.data:
-        raise ConfigError("the following arguments are required: DATA (see 'sst-graph calibrate --help')")
-    twice = [name for name in names if names.count(name) > 1]
-    if twice:
-        raise ConfigError(f"--camera {twice[0]}: found twice, expected each camera once")
-    return names
 
 
 def refuse_rig_options(args: argparse.Namespace) -> None:

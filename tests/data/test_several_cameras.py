@@ -9,8 +9,10 @@ import gtsam
 import numpy as np
 import pytest
 from bags import CLOUD, EPOCH_NS, writing
+from tiny_networks import colour_yaml, write_colour_network
 
 from sst_graph import open_source
+from sst_graph.cli import main
 from sst_graph.data.images import read_mask
 from sst_graph.data.kitti.odometry import KittiSource
 from sst_graph.errors import ConfigError, DataError
@@ -143,6 +145,26 @@ def test_cameras_that_a_bag_has_not(bag: Path) -> None:
         open_source(bag, mask_topic="mask")
     with pytest.raises(DataError, match=r"named by --image-topic; of masks by --mask-topic /cam\d/mask$"):
         open_source(bag)
+
+
+def test_commands_on_the_drive_alone_take_several_cameras(
+    bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = [str(bag), "--mask-topic", "mask"]
+    assert main(["info", "--camera", "cam0", "cam1", *options]) == 0
+    text = capsys.readouterr().out
+    assert [line.split()[3] for line in text.splitlines() if line.startswith("images")] == [
+        "/cam0/image_raw",
+        "/cam1/image_raw",
+    ]
+    assert main(["info", *options, "--camera", "cam0", "cam1", "--json"]) == 0
+    assert list(json.loads(capsys.readouterr().out)) == ["cam0", "cam1"]
+    network = colour_yaml(write_colour_network(tmp_path / "n.onnx"))
+    labels = ["--image-model", str(network), "--out", str(tmp_path / "labels")]
+    assert main(["segment", *options, *labels, "--camera", "cam0", "cam1"]) == 0
+    assert "cam1: 3 labels made, 0 found" in capsys.readouterr().out
+    assert main(["info", str(bag), *options, "--camera", "cam0"]) == 2
+    assert "info: found 2 DATA, expected one" in capsys.readouterr().err
 
 
 def test_cameras_that_kitti_has_not(stereo: Path) -> None:

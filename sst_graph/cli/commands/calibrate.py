@@ -17,8 +17,8 @@ from sst_graph.cli.messages import complain, mention, say
 from sst_graph.cli.output_places import check_apart
 from sst_graph.cli.outputs import CALIBRATION, comparison, exit_code, result_numbers, write_calibration
 from sst_graph.cli.progress import ProgressBar
-from sst_graph.cli.reading import options_of, warn_of_other_pairs, with_image_topic
-from sst_graph.cli.rig import given_cameras, refuse_rig_options, run_rig
+from sst_graph.cli.reading import given_cameras, options_of, warn_of_other_pairs, with_image_topic
+from sst_graph.cli.rig import refuse_rig_options, run_rig
 from sst_graph.cli.video import videos_beside
 from sst_graph.files import atomic_directory
 from sst_graph.files.strict_json import strict_json

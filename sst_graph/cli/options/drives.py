@@ -12,8 +12,10 @@ from sst_graph.cli.options.data import add_label_options, add_networks, add_sour
 def add_info(commands: Commands) -> argparse.ArgumentParser:
     text = "what a drive holds: sensors, rates, stamps, gaps, labels, and what is missing for which method"
     info = commands.add_parser("info", help=text, description=text)
-    info.add_argument("data", metavar="DATA", type=Path, help="dataset or sequence folder, or a bag")
-    add_source_options(info)
+    info.add_argument(
+        "data", metavar="DATA", type=Path, nargs="*", help="dataset or sequence folder, or a bag"
+    )
+    add_source_options(info, several_cameras=True)
     add_label_options(info)
     info.add_argument("--json", action="store_true", help="print JSON (units in the names)")
     return info
@@ -26,8 +28,10 @@ def add_segment(commands: Commands) -> argparse.ArgumentParser:
         help=text,
         description=f"{text[0].upper()}{text[1:]}; docs/how-to/networks.md has examples.",
     )
-    segment.add_argument("data", metavar="DATA", type=Path, help="dataset or sequence folder, or a bag")
-    add_source_options(segment)
+    segment.add_argument(
+        "data", metavar="DATA", type=Path, nargs="*", help="dataset or sequence folder, or a bag"
+    )
+    add_source_options(segment, several_cameras=True)
     add_networks(segment.add_argument_group("networks (docs/how-to/networks.md)"))
     segment.add_argument(
         "--out",
