@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,8 @@ CLOUD, INFO = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/CameraInfo"
 
 _LISTED = 12
 """Topics that an error lists at most."""
+_DEPTH = re.compile(r"/(depth|depth_registered|aligned_depth_to_\w+|disparity)(/|$)")
+"""In the name of a topic of images: depths, as RGB-D cameras publish them beside their colours."""
 _MASK_WORDS = ("mask", "label", "semantic", "segment")
 """In the name of a topic of images: these may be masks of labels."""
 
@@ -48,7 +51,7 @@ def choose_topics(path: Path, topics: Mapping[str, Topic], options: SourceOption
 
     The model of a camera is that beside its images: "/camera/camera_info" for "/camera/image_raw"; a topic of
     masks whose name does not begin with "/" stands there as well. Of images with a compressed copy the plain
-    ones are taken.
+    ones are taken, and of those of an RGB-D camera the colours.
 
     Raises:
         DataError: none or several fit; the topics of the bag are listed.
@@ -93,6 +96,7 @@ def _one(
         topic for topic in fitting if topic.name.removesuffix("/compressed") not in plain - {topic.name}
     ]
     fitting = [topic for topic in fitting if not topic.name.endswith("/compressedDepth")]
+    fitting = [topic for topic in fitting if not _DEPTH.search(topic.name)] or fitting
     if len(fitting) == 1:
         return fitting[0]
     what = " or ".join(types)

@@ -92,6 +92,23 @@ def test_a_compressed_copy_is_no_second_camera(tmp_path: Path, capsys: pytest.Ca
     assert f"4 in {IMAGE}" in capsys.readouterr().out
 
 
+def test_depths_of_an_rgb_d_camera_are_no_second_camera_and_no_lidar(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def depths(bag: BagWriter) -> None:
+        raw = bag.messages.image(EPOCH_NS, np.zeros((24, 64), np.uint8), "16UC1")
+        for topic in ("/front/depth/image_rect_raw", "/front/aligned_depth_to_color/image_raw"):
+            bag.add(topic, raw, EPOCH_NS)
+        bag.add("/front/depth/color/points", cloud(EPOCH_NS), EPOCH_NS)
+
+    assert main(["info", str(made(tmp_path, fill, depths))]) == 0
+    out = capsys.readouterr().out
+    assert f"4 in {IMAGE}" in out and f"4 in {CLOUD}" in out
+    # Where there is nothing else they are taken, or refused by what they hold.
+    alone = made(tmp_path / "alone", lambda bag: fill(bag, [IMAGE, CLOUD]), depths)
+    assert "several topics of sensor_msgs/msg/Image" in refused(capsys, alone)
+
+
 def test_a_named_topic_that_is_not_there_or_of_another_type(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
