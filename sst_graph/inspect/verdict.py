@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import gtsam
 import numpy as np
@@ -190,7 +191,16 @@ def _lens_advice(result: CalibrationResult) -> str:
     free = [name for name in _FREED if name not in estimated]
     if not free or result.method not in _MAY_FREE:
         return f"{advice}."
-    return f"{advice}, or estimate it too: --estimate {','.join(free)}."
+    # With smaller sigmas a sweep that is open makes up more of them: more than it may.
+    given = ", and give --sweep, which the scans leave open" if _open_sweep(result) else ""
+    return f"{advice}, or estimate it too: --estimate {','.join(free)}{given}."
+
+
+def _open_sweep(result: CalibrationResult) -> bool:
+    """Whether the scans of a drive leave undecided how they are timed."""
+    drives = result.diagnostics.get("sweep")
+    entries = drives.values() if isinstance(drives, Mapping) else ()
+    return any(isinstance(entry, Mapping) and entry.get("kind") == "undecided" for entry in entries)
 
 
 def figure(value: float) -> str:

@@ -11,7 +11,7 @@ from sst_graph.batch.method_estimate import package_versions
 from sst_graph.config import to_dict
 from sst_graph.covariance.observability import reasons_of
 from sst_graph.factors.arguments import checked_type
-from sst_graph.fit import MASK_BIAS
+from sst_graph.fit import EDGE_BIAS, MASK_BIAS, bias_entry
 from sst_graph.inspect.gained import KEY, to_document
 from sst_graph.result import CalibrationResult, FrameId, Status
 from sst_graph.tracker.track_update import TrackUpdate, current_update
@@ -56,6 +56,7 @@ def tracker_result(tracker: Tracker, drive: str, camera_name: str) -> Calibratio
     used = [FrameId(drive, scan.index) for number, scan in window.scans if number in entries]
     model = None if estimate.smoother is None else estimate.smoother.model
     guess, config = tracker.initializer.guess, tracker.setup.config.estimating
+    biases_px = estimate.point.state(config.calibration.classes).biases_px
     return CalibrationResult(
         T_camera_lidar=last.T_camera_lidar,
         time_offset_s=last.time_offset_s,
@@ -73,10 +74,7 @@ def tracker_result(tracker: Tracker, drive: str, camera_name: str) -> Calibratio
         diagnostics={
             "scans": window.next_scan,
             "matches": last.matches,
-            MASK_BIAS: {
-                c.name.lower(): bias
-                for (_, c), bias in estimate.point.state(config.calibration.classes).biases_px.items()
-            },
+            MASK_BIAS if estimate.edges is None else EDGE_BIAS: bias_entry([drive], biases_px),
             "assumptions": assumption_report(estimate.considered(), estimate.findings),
             "estimated": last.to_dict()["estimated"],
             "error_model": None

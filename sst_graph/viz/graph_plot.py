@@ -35,7 +35,7 @@ def draw_graph(figure: Any, inspection: Inspection) -> Any:
     twists = result.method in ("joint", "track")
     for k, (drive, frame) in enumerate(shown):
         clock = tops[f"D{drive}" if offsets else "D"]
-        mine = [at for (owner, _), at in bases.items() if owner in ("", drive)]
+        mine = [at for (owner, _), at in bases.items() if owner == drive]
         name = f"{drive}:{frame}" if len({owner for owner, _ in frames}) > 1 else f"frame {frame}"
         drawn = _Frame(float(k), f"V{frame}" if twists else None, name, [tops["E"], clock], mine)
         _draw_frame(ax, drawn)
@@ -109,11 +109,11 @@ def _draw_shared(
 
 
 def _biases(found: Any, drives: set[str]) -> list[tuple[str, str]]:
-    """(drive or "", class) of every mask bias that the result names for the drives shown."""
+    """(drive, class) of every mask bias that the result names for the drives shown."""
     if not isinstance(found, Mapping):
         return []
     pairs = [tuple(str(name).rpartition(":")[::2]) for name in found]
-    return [(drive, label) for drive, label in pairs if not drive or drive in drives]
+    return [(drive, label) for drive, label in pairs if drive in drives]
 
 
 def _caption(inspection: Inspection, frames: int) -> str:

@@ -98,6 +98,11 @@ def test_the_lens_counts_in_the_corners_only() -> None:
     assert said.endswith("calibrate the lens, or estimate it too: --estimate focal,k1.")
     diagnostics = {**_with_k1().diagnostics, "estimated": {"focal": {"value": 0.0, "sigma": 1e-3}}}
     assert verdict(replace(_with_k1(), diagnostics=diagnostics)).endswith(": --estimate k1.")
+    # A sweep that the scans leave open would make up more of sigmas that are smaller.
+    sweep = {"a/00": {"kind": "undecided"}, "b/00": {"kind": "clockwise"}}
+    swept = {**_with_k1().diagnostics, "sweep": sweep}
+    said = verdict(replace(_with_k1(), diagnostics=swept))
+    assert said.endswith("--estimate focal,k1, and give --sweep, which the scans leave open.")
     assert verdict(_with_k1("motion")).endswith("For better corners calibrate the lens.")
     assert "lens" not in verdict(_result([TINY, TINY, 0.1 * DEG] + [TINY] * 4))
 

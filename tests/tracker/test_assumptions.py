@@ -24,6 +24,7 @@ from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import ImageFeatures, prepare_drive
 from sst_graph.errors import ConfigError
 from sst_graph.experiments.wrong_drives import with_distortion, with_principal_point
+from sst_graph.fit import mask_biases_px
 from sst_graph.graph.building import joint_graph
 from sst_graph.graph.drive_motion import motions_of
 from sst_graph.graph.outer_loop import JointProblem, solve_joint
@@ -33,6 +34,7 @@ from sst_graph.tracker.sums.running_sums import RunningSums
 from sst_graph.tracker.track_update import current_update
 from sst_graph.tracker.window.gaussian import Gaussian, Point
 from sst_graph.tracker.window.window import Window
+from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
 K1 = -0.3
@@ -226,7 +228,10 @@ def test_time_counts_from_the_first_image_whatever_is_kept(street: KeptDrive) ->
 def test_a_clean_street_contradicts_nothing(optimized: Tracker) -> None:
     update = current_update(optimized)
     assert update.contradictions == () and update.status == "ok" and update.estimated == {}
-    report = optimized.result().diagnostics["assumptions"]
+    diagnostics = optimized.result("a/00").diagnostics
+    bias_px = float(optimized.estimate.point.biases_px[0])
+    assert mask_biases_px(diagnostics, "a/00") == {SemanticClass.VEHICLE: bias_px} and bias_px != 0.0
+    report = diagnostics["assumptions"]
     assert list(report) == list(ASSUMPTIONS)
     tested = {name for name, entry in report.items() if "estimate" in entry}
     assert tested == {name for name, assumption in ASSUMPTIONS.items() if assumption.by_matches}

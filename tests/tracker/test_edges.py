@@ -23,6 +23,7 @@ from sst_graph.cli import main
 from sst_graph.experiments.starts import error_of, errors_of
 from sst_graph.factors.alignment import weighted_residuals
 from sst_graph.features.picture_gradients import PictureGradients
+from sst_graph.fit import EDGE_BIAS, MASK_BIAS
 from sst_graph.graph.known import KnownCalibration
 from sst_graph.graph.state import State
 from sst_graph.hand_eye.graph import camera_steps
@@ -252,6 +253,7 @@ def test_a_doubt_is_a_status() -> None:
     assert tracker.estimate.reasons == ("the pose may be wrong altogether",)
     result = tracker.result()
     assert result.status == "not_converged" and "the pose may be wrong altogether" in result.reasons[0]
+    assert list(result.diagnostics[EDGE_BIAS]) == ["stream:object"] and MASK_BIAS not in result.diagnostics
 
 
 def test_a_checkpoint_before_the_start_goes_on_alike(tmp_path: Path) -> None:
