@@ -7,8 +7,8 @@ A table stands between two comments, of which the first holds the command that m
     <!-- table: sst-graph experiment fit --set 'seeds=[21,22]' -->
     <!-- end of table -->
 
-What the command prints goes between them, with the command above it and the version of the code below it. A table
-without a version is of unknown code, and counts as one that this code has not made.
+What the command prints goes between them, with the command above it and the version of the code below it. A
+table without a version is of unknown code, and counts as one that this code has not made.
 Words choose tables whose page or command has all of them. Tables that this code, or code that does not differ
 from it but for comments and docstrings, has made are left as they are; so what was interrupted goes on.
 """
