@@ -6,7 +6,15 @@ import numpy as np
 
 from checks import fault_matrix, fuzz
 from sst_graph.experiments import assumptions
-from studies import broken_lens, contradictions, fused_drives, shaking_pictures, small_streets, sweep
+from studies import (
+    broken_lens,
+    contradictions,
+    fused_drives,
+    principal_point,
+    shaking_pictures,
+    small_streets,
+    sweep,
+)
 
 
 def test_steps_that_are_found() -> None:
@@ -75,6 +83,14 @@ def test_broken_assumptions_by_their_sizes_in_sigmas() -> None:
     found = assumptions.table(runs, in_sigmas=True).splitlines()
     assert found[0] == "| broken | σ | ± 2 σ | ± 5 σ |"
     assert found[2] == "| `k1` | 0.01 | 0, 0, 0, 0 of 2; 0.57, 0.57 | 1, 1, 0, 0 of 1; 0.57, 0.57 |"
+
+
+def test_a_principal_point_that_is_off() -> None:
+    found = {("5, 0 px", "0.1"): [("ok", 4.1), ("not_converged", 9.0), ("ok", 2.0)], ("0, 0 px", "0.1"): []}
+    assert principal_point.summary(found).splitlines()[2:] == [
+        "| 5, 0 px | 0.1 | 2 of 3 | 2.0 to 4.1 |",
+        "| 0, 0 px | 0.1 | 0 of 0 | – |",
+    ]
 
 
 def test_faults_by_command() -> None:
