@@ -1,9 +1,10 @@
-"""Largest memory of `sst-graph calibrate` on drives of several lengths. Prints one line a length.
+"""Memory, processor time and errors of `sst-graph calibrate` on drives of several lengths. Prints a table.
 
     OMP_NUM_THREADS=1 python benchmarks/calibrate_memory.py --frames 60 400
+    OMP_NUM_THREADS=1 python benchmarks/calibrate_memory.py --frames 60 400 --method edges --half
 
-A street is simulated with pictures of half KITTI's size and written to a temporary folder; DATA takes a drive
-that is there. Each calibration runs in a process of its own, whose largest resident memory the kernel tells.
+A street of each seed is simulated and written to a temporary folder, with ``--half`` with pictures of half
+KITTI's size. Each calibration runs in a process of its own, whose largest resident memory the kernel tells.
 """
 
 from __future__ import annotations
@@ -13,16 +14,25 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+
+from sst_graph.experiments.markdown import lines
+from sst_graph.metrics import calibration_errors
+from sst_graph.result import read_result
 from sst_graph.simulator import SimulationConfig, simulate, write_drive
+from sst_graph.types import GroundTruth
+
+HEAD = "| frames | peak memory [MB] | processor [s] | rotation [deg] | translation (ATD) [cm] | NEES of 7 |"
+HALF = {"width": 621, "height": 188}
 
 
-def peak_mb(drive: Path, frames: int, method: str, out: Path) -> float:
-    """Largest resident memory [MB] of a calibration of the first frames."""
-    arguments = ["calibrate", str(drive), "--frames", f"0:{frames}", "--method", method, "--out", str(out)]
+def calibrated(drive: Path, truth: GroundTruth, arguments: list[str], out: Path) -> tuple[float, ...]:
+    """Peak memory [MB], user and system seconds, rotation [deg], ATD [cm] and NEES of a calibration."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "sst_graph", *arguments],
+        [sys.executable, "-m", "sst_graph", "calibrate", str(drive), "--out", str(out), *arguments],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
@@ -30,29 +40,48 @@ def peak_mb(drive: Path, frames: int, method: str, out: Path) -> float:
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode not in (0, 3):  # 3: finished, but not to be trusted
         raise SystemExit(f"calibrate ended with {process.returncode}")
-    return usage.ru_maxrss / 1024.0
+    result = read_result(out)
+    errors = calibration_errors(result.T_camera_lidar, result.time_offset_s, truth, result.covariance)
+    seconds = usage.ru_utime + usage.ru_stime
+    nees = np.nan if errors.nees is None else errors.nees.joint
+    return usage.ru_maxrss / 1024.0, seconds, errors.qad_deg, 100.0 * errors.atd_m, nees
+
+
+def rows(args: argparse.Namespace) -> Iterator[list[str]]:
+    """A row for each length; cells: one figure for each seed."""
+    streets = {
+        seed: simulate(SimulationConfig(seed=seed, frames=max(args.frames), **(HALF if args.half else {})))
+        for seed in args.seeds
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        for seed, street in streets.items():
+            write_drive(street, Path(folder) / f"drive{seed}")
+        for frames in args.frames:
+            some = ["--frames", f"0:{frames}", "--method", args.method]
+            found = [
+                calibrated(
+                    Path(folder) / f"drive{seed}", street.truth, some, Path(folder) / f"out{seed}_{frames}"
+                )
+                for seed, street in streets.items()
+            ]
+            columns = zip(*found, strict=True)
+            cells = (
+                "; ".join(f"{value:.{digits}f}" for value in column)
+                for column, digits in zip(columns, (0, 0, 3, 2, 1), strict=True)
+            )
+            yield [f"{frames:,}", *cells]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("data", nargs="?", type=Path)
     parser.add_argument("--frames", nargs="+", type=int, default=[60, 400])
     parser.add_argument("--method", default="auto")
-    parser.add_argument("--seed", type=int, default=5)
-    args = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        drive = args.data
-        if drive is None:
-            drive = Path(folder) / "drive"
-            config = SimulationConfig(seed=args.seed, frames=max(args.frames), width=621, height=188)
-            write_drive(simulate(config), drive)
-        first = None
-        for frames in args.frames:
-            peak = peak_mb(drive, frames, args.method, Path(folder) / f"out{frames}")
-            first = peak if first is None else first
-            print(f"{frames} frames: {peak:.0f} MB, {peak / first:.2f} times the first", flush=True)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[5, 6])
+    parser.add_argument("--half", action="store_true", help="pictures of half the size")
+    for line in lines(HEAD, rows(parser.parse_args())):
+        print(line, flush=True)
 
 
 if __name__ == "__main__":

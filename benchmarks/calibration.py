@@ -16,11 +16,13 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from sst_graph.experiments.markdown import lines
 from sst_graph.simulator import SimulationConfig, simulate, write_drive
 
 HERE = Path(__file__).resolve().parents[1]
@@ -60,7 +62,7 @@ def calibrated(code: Path, arguments: list[str], out: Path) -> Run:
     return Run(usage.ru_utime, "".join(lines))
 
 
-def compared(name: str, arguments: list[str], other: Path, pairs: int, out: Path) -> str:
+def compared(name: str, arguments: list[str], other: Path, pairs: int, out: Path) -> list[str]:
     """A row of the table, from so many pairs of runs."""
     found = [[calibrated(code, arguments, out) for code in (other, HERE)] for _ in range(pairs)]
     seconds = np.array([[run.seconds for run in pair] for pair in found])
@@ -68,7 +70,7 @@ def compared(name: str, arguments: list[str], other: Path, pairs: int, out: Path
     alike = len({run.printed for pair in found for run in pair}) == 1
     cells = [name, f"{np.median(seconds[:, 0]):.1f}", f"{np.median(seconds[:, 1]):.1f}"]
     cells += [f"{np.median(ratios):.2f}", f"{ratios.min():.2f} to {ratios.max():.2f}"]
-    return f"| {' | '.join([*cells, 'yes' if alike else 'no'])} |"
+    return [*cells, "yes" if alike else "no"]
 
 
 def main() -> None:
@@ -78,21 +80,26 @@ def main() -> None:
     parser.add_argument("--drive", help="a drive on disk instead of simulated streets")
     parser.add_argument("--image-shift", type=int, default=0)
     args = parser.parse_args()
+    head = f"| calibration, {args.pairs} pairs | other [s] | this [s] | ratio | of the pairs | same output |"
+    for line in lines(head, rows(args)):
+        print(line, flush=True)
+
+
+def rows(args: argparse.Namespace) -> Iterator[list[str]]:
+    """A row for the drive, or for each street."""
     other = args.other.resolve()
-    print(f"| calibration, {args.pairs} pairs | other [s] | this [s] | ratio | of the pairs | same output |")
-    print("|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         if args.drive is not None:
             data = str(Path(args.drive).resolve())
             some = [data, "--image-shift", str(args.image_shift)]
-            print(compared(Path(data).name, some, other, args.pairs, place), flush=True)
+            yield compared(Path(data).name, some, other, args.pairs, place)
             return
         for frames in FRAMES:
             street = place / f"street_{frames}"
             write_drive(simulate(SimulationConfig(seed=3, frames=frames)), street)
             name = f"street, {frames} frame{'s' * (frames > 1)}"
-            print(compared(name, [str(street)], other, args.pairs, place), flush=True)
+            yield compared(name, [str(street)], other, args.pairs, place)
 
 
 if __name__ == "__main__":

@@ -43,6 +43,8 @@ from benchmarks.workloads import (
 )
 from sst_graph.association.edge_matching import match_edges
 from sst_graph.association.nearest import match_nearest
+from sst_graph.experiments import markdown
+from sst_graph.experiments.markdown import NONE
 from sst_graph.factors import Alignment, frame_factor, silhouette_factor
 from sst_graph.factors.motion import se3_left_jacobian
 from sst_graph.graph.building import motion_factor, prior_graph
@@ -252,31 +254,34 @@ def edge_ways(work: DriveWork) -> Ways:
 
 def table(rows: Sequence[tuple[str, Ways]], rounds: int) -> str:
     others = SINGLE, SCIPY, COMPILED, LOOP
-    lines = [f"| | ours [ms] | {' | '.join(others)} | ours / {COMPILED} |", "|---|---|---|---|---|---|---|"]
+    found = []
     for name, ways in rows:
         slow = {key: ways[key] for key in ways if key == SINGLE}
         took = best_seconds({key: ways[key] for key in ways if key not in slow}, rounds)
         took |= {key: best_seconds({key: way}, 3)[key] for key, way in slow.items()}
-        cells = [f"{took[key] / took[OURS]:.3g}" if key in took else "–" for key in others]
+        cells = [f"{took[key] / took[OURS]:.3g}" if key in took else NONE for key in others]
         ratio = took[OURS] / took[COMPILED]
-        lines.append(f"| {name} | {1e3 * took[OURS]:.2f} | {' | '.join(cells)} | {ratio:.2f} |")
-    return "\n".join(lines)
+        found.append([name, f"{1e3 * took[OURS]:.2f}", *cells, f"{ratio:.2f}"])
+    return markdown.table(f"| | ours [ms] | {' | '.join(others)} | ours / {COMPILED} |", found)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--frames", type=int, default=20, help="of the drive")
+    parser.add_argument("--frames", type=int, nargs="+", default=[20], help="of each drive")
     parser.add_argument("--rounds", type=int, default=40, help="turns, of which the best counts")
     args = parser.parse_args()
-    work = DriveWork.of(street(args.frames, width=1242, height=375, moving_fraction=0.0))
     rows = [
         ("linearize a frame: 5,000 points, 1,500 pixels", frame_ways()),
-        (f"linearize a drive: {len(work.matches):,} matches in {args.frames} frames", drive_ways(work)),
         ("match a frame: 5,000 points, 1,500 pixels", nearest_ways()),
-        (f"match a drive: {len(work.edges):,} boundary points", edge_ways(work)),
     ]
+    for frames in args.frames:
+        work = DriveWork.of(street(frames, width=1242, height=375, moving_fraction=0.0))
+        rows += [
+            (f"linearize a drive: {len(work.matches):,} matches in {frames} frames", drive_ways(work)),
+            (f"match a drive: {len(work.edges):,} boundary points", edge_ways(work)),
+        ]
     print(table(rows, args.rounds))
 
 

@@ -39,6 +39,7 @@ from sst_graph import CalibrationConfig, open_source
 from sst_graph.batch.calibrate import calibrate_prepared, prepare_drives
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.drive.preparation import Drive
+from sst_graph.experiments.markdown import table
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.graph.outer_loop import solve_joint
 from sst_graph.graph.state import State
@@ -85,14 +86,14 @@ class Series:
     def table(self) -> str:
         whole = any(self.statuses)
         heads = [*COSTS, *([WHOLE, "status"] if whole else [])]
-        lines = [f"| {self.unknown} | {' | '.join(heads)} |", "|---" * (1 + len(heads)) + "|"]
+        rows = []
         for size, cost, status in zip(self.sizes, self.costs, self.statuses, strict=True):
             cells = [f"{one:.0f}" if one > 100.0 else f"{one:.2f}" for one in cost]
-            lines.append(f"| {size:,.0f} | {' | '.join([*cells, *([status] if whole else [])])} |")
+            rows.append([f"{size:,.0f}", *cells, *([status] if whole else [])])
         for name, slopes in zip(("slope", "slope of the last two"), self.slopes(), strict=True):
             cells = [f"{slope:.2f}" for slope in slopes]
-            lines.append(f"| {name} | {' | '.join([*cells, *([''] if whole else [])])} |")
-        return "\n".join(lines)
+            rows.append([name, *cells, *([""] if whole else [])])
+        return table(f"| {self.unknown} | {' | '.join(heads)} |", rows)
 
 
 def peak_mb() -> float:
@@ -289,8 +290,8 @@ def main() -> None:
     for name in args.only:
         with tempfile.TemporaryDirectory() as folder:
             series.append(SERIES[name](Path(folder), sizes[name], args.whole))
-        print(series[-1].table() + "\n", flush=True)
-        (args.out / "scaling.md").write_text("\n\n".join(each.table() for each in series) + "\n")
+        print(series[-1].table(), flush=True)
+        (args.out / "scaling.md").write_text("\n".join(each.table() for each in series))
     draw(series, args.out / "scaling.svg")
 
 

@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph import Tracker, TrackerConfig, open_source
+from sst_graph.experiments import markdown
 from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.tracker.config import DriftConfig
 from sst_graph.tracker.storage.checkpoint import Saver
@@ -74,15 +75,16 @@ def _quantiles(costs: NDArray[np.float64]) -> dict[str, float]:
 
 def table(costs_ms: NDArray[np.float64], memory_mb: NDArray[np.float64]) -> str:
     """Cost of a frame and largest memory until then, of all frames and of each fifth of them."""
-    lines = ["| frames | median [ms] | p99 / median | slowest / median | its frame | memory [MB] |"]
-    lines.append("|---|---|---|---|---|---|")
+    rows = []
     for part in (np.arange(len(costs_ms)), *np.array_split(np.arange(len(costs_ms)), 5)):
         own = costs_ms[part]
         median, p99, slowest = np.median(own), np.quantile(own, 0.99), own.max()
         cells = [f"{median:.1f}", f"{p99 / median:.2f}", f"{slowest / median:.2f}"]
         cells += [str(part[own.argmax()]), f"{memory_mb[part[-1]]:.0f}"]
-        lines.append(f"| {part[0]:,} to {part[-1]:,} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        rows.append([f"{part[0]:,} to {part[-1]:,}", *cells])
+    return markdown.table(
+        "| frames | median [ms] | p99 / median | slowest / median | its frame | memory [MB] |", rows
+    )
 
 
 class Timed:
@@ -185,6 +187,7 @@ def main() -> None:
     costs = timed.ms
     if args.markdown:
         print(table(np.array(costs), np.array(memory)))
+        print(f"{len(alarms)} alarms, largest statistic {max(chi2, default=0.0):.1f}.")
         return
     steady, settles = np.array(costs[WARM_UP:]), np.array(relinearizing[WARM_UP:])
     block = min(500, len(steady) // 2)

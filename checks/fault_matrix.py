@@ -44,6 +44,8 @@ from checks.fault_commands import (
     write_inputs,
 )
 from sst_graph.errors import SstGraphError
+from sst_graph.experiments import markdown
+from sst_graph.experiments.markdown import NONE
 from sst_graph.files.staging import SUFFIX
 from sst_graph.tracker import Tracker
 
@@ -434,15 +436,13 @@ def _before_the_program(ended: Ended, number: int) -> bool:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """The rows in Markdown."""
-    lines = [
-        "| command | fault | runs | finished before it | early | failures |",
-        "|---|---|---|---|---|---|",
-    ]
-    for row in rows:
-        numbers = f"{row.runs} | {row.finished} | {row.early} | {len(row.failures)}"
-        lines.append(f"| {row.command} | {row.fault} | {numbers} |")
-    return "\n".join(lines) + "\n"
+    """Failures of runs in Markdown: a line for each fault, a column for each command."""
+    cells = {(row.fault, row.command): f"{len(row.failures)} of {row.runs}" for row in rows}
+    commands, faults = (dict.fromkeys(names) for names in zip(*((c, f) for f, c in cells), strict=True))
+    head = f"| fault | {' | '.join(f'`{command}`' for command in commands)} |"
+    return markdown.table(
+        head, ([fault, *(cells.get((fault, command), NONE) for command in commands)] for fault in faults)
+    )
 
 
 def all_rows(bench: Bench, moments: int, chosen: Sequence[str], commands: Sequence[str]) -> Iterator[Row]:
@@ -494,7 +494,9 @@ def main() -> int:
         for row in all_rows(bench, args.moments, args.rows.split(","), args.commands.split(",")):
             rows.append(row)
             print(
-                f"{row.command}, {row.fault}: {row.runs} runs, {len(row.failures)} failures", file=sys.stderr
+                f"{row.command}, {row.fault}: {row.runs} runs ({row.finished} finished before it, "
+                f"{row.early} early), {len(row.failures)} failures",
+                file=sys.stderr,
             )
             for failure in row.failures[:5]:
                 print("   ", failure, file=sys.stderr, flush=True)

@@ -27,7 +27,7 @@ import tempfile
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -45,6 +45,7 @@ from sst_graph.config import read_config, with_overrides
 from sst_graph.config import to_dict as config_to_dict
 from sst_graph.drive.preparation import prepare_drive
 from sst_graph.errors import SstGraphError
+from sst_graph.experiments import markdown
 from sst_graph.export import ExportOptions, export_text
 from sst_graph.export.marginal import fuse_marginals, marginal_of_result, read_marginal
 from sst_graph.imports import ImportOptions, import_calibration, read_tree
@@ -628,30 +629,35 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=float("inf"), help="begin no case after so long")
     parser.add_argument("--started", action="store_true", help="the checkpoint's tracker has started")
     args = parser.parse_args()
-    found: Counter[tuple[str, str]] = Counter()
-    slowest, failures, done, began = Case(0, "", "", "", 0.0), 0, 0, time.monotonic()
+    tried_cases: list[Case] = []
+    began = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         prepare(Path(folder), args.started)
         numbers = plan(args.seed, args.count, args.kind or usual)
         if args.only is not None:
             numbers = [numbers[args.only]]
         for case in cases(Path(folder), Trials(args.seed), numbers):
-            found[case.kind, case.verdict] += 1
-            done += 1
-            slowest = max(slowest, case, key=lambda each: each.seconds)
+            tried_cases.append(case)
             if case.verdict == "FAILURE" or args.only is not None:
-                failures += case.verdict == "FAILURE"
                 print(f"{case.number} {case.kind}: {case.verdict} {case.why}", flush=True)
             if time.monotonic() - began > 60.0 * args.minutes:
                 break
-    for kind in dict.fromkeys(kind for kind, _ in found):
-        ends = ", ".join(f"{count} {verdict}" for (k, verdict), count in sorted(found.items()) if k == kind)
-        print(f"{kind:<12} {ends}")
-    print(
-        f"{done} inputs, seed {args.seed}: {failures} failures, "
-        f"slowest {slowest.seconds:.2f} s ({slowest.number} {slowest.kind})"
-    )
-    return 1 if failures else 0
+    print(table_of(tried_cases))
+    return int(any(case.verdict == "FAILURE" for case in tried_cases))
+
+
+def table_of(tried_cases: Sequence[Case]) -> str:
+    """Inputs, verdicts and the slowest of each kind, and of all."""
+    kinds = dict.fromkeys(case.kind for case in tried_cases)
+    groups = {kind: [case for case in tried_cases if case.kind == kind] for kind in sorted(kinds)}
+    rows = []
+    for name, some in (*groups.items(), ("all", tried_cases)):
+        ends = Counter(case.verdict for case in some)
+        failures = ends.pop("FAILURE", 0)
+        said = ", ".join(f"{count} {verdict}" for verdict, count in sorted(ends.items()))
+        slowest = max((case.seconds for case in some), default=0.0)
+        rows.append([name, str(len(some)), said, str(failures), f"{slowest:.2f}"])
+    return markdown.table("| kind of input | inputs | ended with | failures | slowest [s] |", rows)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,8 @@ A table stands between two comments, of which the first holds the command that m
     <!-- table: sst-graph experiment fit --set 'seeds=[21,22]' -->
     <!-- end of table -->
 
-What the command prints goes between them, with the command above it and the version of the code below it.
+What the command prints goes between them, with the command above it and the version of the code below it. A
+table without a version is of unknown code, and counts as one that this code has not made.
 Words choose tables whose page or command has all of them. Tables that this code, or code that does not differ
 from it but for comments and docstrings, has made are left as they are; so what was interrupted goes on.
 """
@@ -30,6 +31,8 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 CODE = {"sst-graph": ("sst_graph", "factors"), "python": ("sst_graph", "factors", "studies")}
 """Folders that the figures of a command depend on, by its first word."""
+_APART = re.compile(r"\b(benchmarks|checks)[./]")
+"""In commands: the folder of a program that is no study."""
 DRIVES = ("STOP", "PARKED")
 """Names in commands that stand for the folders of drives."""
 BLOCK = re.compile(r"<!-- table: (?P<command>.+?) -->\n(?P<body>.*?)<!-- end of table -->", re.DOTALL)
@@ -137,7 +140,7 @@ def same_code(commit: str, command: str) -> bool:
     """
     if not commit:
         return False
-    folders = CODE["python" if "python" in command.split() else "sst-graph"]
+    folders = (*CODE["python" if "python" in command.split() else "sst-graph"], *_APART.findall(command))
     changed = _git("diff", "--name-only", "--no-renames", "--diff-filter=a", commit, "--", *folders)
     return changed is not None and all(_same_file(commit, name) for name in changed.splitlines())
 

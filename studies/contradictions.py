@@ -1,4 +1,4 @@
-"""Steps of mount and clock in mid-drive: which sizes are found, and what is found on clean drives.
+"""Steps of mount and clock in mid-drive: which sizes are found, and what is found on clean drives: tables.
 
     OMP_NUM_THREADS=1 python studies/contradictions.py --streets 6
     OMP_NUM_THREADS=1 python studies/contradictions.py --streets 50 --clean
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import gtsam
@@ -24,6 +24,7 @@ from sst_graph.batch.part_solver import PartSolver
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.errors import EstimationError
+from sst_graph.experiments.markdown import table
 from sst_graph.graph.outer_loop import NARROW_KERNELS_PX, solve_joint
 from sst_graph.graph.state import State
 from sst_graph.simulator import SimulationConfig, simulate
@@ -110,6 +111,27 @@ def place_of(seed: int) -> tuple[int, np.ndarray]:
     return int(rng.integers(FRAMES // 4, 3 * FRAMES // 4 + 1)), rng.normal(size=3)
 
 
+Steps = Mapping[int, Sequence[bool]]
+"""By seed: whether each step was found."""
+
+
+def knocks_table(found: Steps) -> str:
+    """On how many streets a knock of each size is found."""
+    sizes = " | ".join(f"{degrees:g}°" for degrees in KNOCKS_DEG)
+    counts = [f"{sum(hits)} of {len(found)}" for hits in zip(*found.values(), strict=True)]
+    return table(f"| knock | {sizes} |", [["found", *counts]])
+
+
+def clocks_table(found: Steps) -> str:
+    """Which steps of the clock are found on each street."""
+    sizes = " | ".join(f"{ms:g} ms" for ms in CLOCKS_MS)
+    rows = [
+        [f"seed {seed} ({street(seed).motion})", *("yes" if hit else "no" for hit in hits)]
+        for seed, hits in found.items()
+    ]
+    return table(f"| clock step | {sizes} |", rows)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -127,30 +149,26 @@ def main() -> None:
             alarms += bool(sentences)
             said = " ".join(sentences) or "nothing"
             print(f"seed {seed}, {street(seed).motion}: {said}", file=sys.stderr, flush=True)
-        print(f"| clean drives | with an alarm |\n|---|---|\n| {len(seeds)} | {alarms} |")
+        print(table("| clean drives | with an alarm |", [[str(len(seeds)), str(alarms)]]))
         return
     sizes = [("knock", f"{degrees:g} deg") for degrees in KNOCKS_DEG]
     sizes += [("clock", f"{ms:g} ms") for ms in CLOCKS_MS]
-    hits, near = np.zeros(len(sizes), int), np.zeros(len(sizes), int)
+    hits: dict[int, list[bool]] = {}
     for seed in seeds:
         first, axis = place_of(seed)
         edits = [lambda f, d=d, k=first, a=axis: knocked(f, k, a, d) for d in KNOCKS_DEG]
         edits += [lambda f, ms=ms, k=first: clock_set(f, k, ms) for ms in CLOCKS_MS]
         for number, found in enumerate(found_in(seed, edits)):
-            steps = [] if found is None else found.diagnostics["within"]
-            hits[number] += bool(steps)
-            near[number] += any(
-                min(abs(step["frames"][0] - first), abs(step["frames"][1] + 1 - first)) <= 3 for step in steps
-            )
+            hits.setdefault(seed, []).append(found is not None and bool(found.diagnostics["within"]))
             print(
                 f"seed {seed}, {street(seed).motion}, {' '.join(sizes[number])} at {first}: "
                 f"{' '.join(found.sentences) if found else 'no solution'}",
                 file=sys.stderr,
                 flush=True,
             )
-    print("| step | size | found | place within 3 frames |\n|---|---|---|---|")
-    for (kind, size), hit, place in zip(sizes, hits, near, strict=True):
-        print(f"| {kind} | {size} | {hit} of {len(seeds)} | {place} |")
+    knocks = len(KNOCKS_DEG)
+    print(knocks_table({seed: some[:knocks] for seed, some in hits.items()}))
+    print(clocks_table({seed: some[knocks:] for seed, some in hits.items()}))
 
 
 if __name__ == "__main__":

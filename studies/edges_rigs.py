@@ -9,10 +9,12 @@ trigger. NEES are divided by their dimension.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from sst_graph import CalibrationConfig
+from sst_graph.experiments.markdown import lines
 from sst_graph.metrics import nees, tangent_error
 from sst_graph.rig import KnownPose, KnownRig, RigResult
 from sst_graph.rig.calibrate import calibrate_rig_prepared, prepare_rig
@@ -22,13 +24,17 @@ from sst_graph.types import Guess
 from studies.edges_streets import source_of, start_step
 
 CONFIG = CalibrationConfig(method="edges")
+HEAD = (
+    "| street | known | left | NEES | right | NEES | of both | of the pose between "
+    "| correlation of roll, pitch, yaw |"
+)
 KNOWN = {
     "own images": KnownRig(),
     "known pose, one trigger": KnownRig((KnownPose("right", "left", stereo_pose()),), one_trigger=True),
 }
 
 
-def row(rig: dict[str, SimulatedDrive], result: RigResult) -> str:
+def row(rig: dict[str, SimulatedDrive], result: RigResult) -> list[str]:
     """Errors of both cameras, the NEES of each, of both at once and of the pose between them."""
     errors, cells = [], []
     for name, drive in rig.items():
@@ -46,18 +52,19 @@ def row(rig: dict[str, SimulatedDrive], result: RigResult) -> str:
     of_both, of_pose = nees(np.concatenate(errors), result.covariance), nees(step, between.covariance)
     cells += [f"{of_both / 14:.2f}", f"{of_pose / 6:.2f}"]
     cells.append(", ".join(f"{value:.2f}" for value in shared[:3]))
-    return " | ".join(cells)
+    return cells
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--seeds", type=int, nargs="+", default=[507, 504])
-    print(
-        "| street | known | left | NEES | right | NEES | of both | of the pose between | shared rotation |\n"
-        + "|---" * 9
-        + "|"
-    )
-    for seed in parser.parse_args().seeds:
+    for line in lines(HEAD, rows(parser.parse_args().seeds)):
+        print(line, flush=True)
+
+
+def rows(seeds: Sequence[int]) -> Iterator[list[str]]:
+    """Each street with and without what is known of its rig."""
+    for seed in seeds:
         name = f"own-{seed}"
         drive = source_of(name)
         assert isinstance(drive, SimulatedDrive)
@@ -67,7 +74,7 @@ def main() -> None:
         guesses = {camera: Guess(one.truth.cTl.retract(start)) for camera, one in rig.items()}
         for known, what in KNOWN.items():
             found = calibrate_rig_prepared(drives, guesses, CONFIG, what)
-            print(f"| `{name}` | {known} | {row(rig, found)} |", flush=True)
+            yield [f"`{name}`", known, *row(rig, found)]
 
 
 if __name__ == "__main__":

@@ -40,6 +40,7 @@ from pathlib import Path
 import numpy as np
 
 from sst_graph.cli import main as main_of_program
+from sst_graph.experiments.markdown import table
 from sst_graph.files import MANIFEST
 from sst_graph.fleet import BatchConfig, ListedDrive, Place, Record, write_summary
 from sst_graph.fleet import batch as fleet_batch
@@ -299,13 +300,13 @@ def measure_scheduler(count: int, folder: Path, workers: int, dask: str) -> None
         for k in range(count)
     ]
     out, config = Place(str(folder)), BatchConfig(workers=workers, dask=dask)
-    print("| step | seconds | a drive |\n|---|---|---|")
+    rows: list[list[str]] = []
 
     def timed(name: str, work: Callable[[], object]) -> object:
         started = time.monotonic()
         found = work()
         seconds = time.monotonic() - started
-        print(f"| {name} | {seconds:.1f} | {1e3 * seconds / count:.2f} ms |", flush=True)
+        rows.append([name, f"{seconds:.1f}", f"{1e3 * seconds / count:.2f} ms"])
         return found
 
     def run() -> dict[str, Record]:
@@ -317,7 +318,8 @@ def measure_scheduler(count: int, folder: Path, workers: int, dask: str) -> None
     timed("vehicles fused, summary written", lambda: write_summary(drives, records, out, config))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     size = (folder / "summary.html").stat().st_size / 1e6
-    print(f"| largest memory of the batch | {peak:.0f} MB | |\n| summary.html | {size:.1f} MB | |")
+    rows += [["largest memory of the batch", f"{peak:.0f} MB", ""], ["summary.html", f"{size:.1f} MB", ""]]
+    print(table("| step | seconds | a drive |", rows))
 
 
 def main() -> None:
@@ -345,52 +347,54 @@ def main() -> None:
     calibrate_in_this_process(drives, alone)
     kill_at_random = partial(run_with_kills, rng=np.random.default_rng(given.seed), every_s=given.kill_every)
 
-    print("| what | found |\n|---|---|")
-    print(f"| drives, vehicles, drives that cannot be read | {len(drives)}, {given.vehicles}, {len(bad)} |")
+    what = "drives, vehicles, drives that cannot be read"
+    rows = [[what, f"{len(drives)}, {given.vehicles}, {len(bad)}"]]
     batch = given.out / "batch"
     killed = kill_at_random(batch_command(given.out / "drives", batch), batches=given.kill_batch)
-    print(f"| processes of drives killed, batches killed | {killed.drives}, {killed.batches} |", flush=True)
-    print_outcome(batch, drives, alone)
+    rows.append(["processes of drives killed, batches killed", f"{killed.drives}, {killed.batches}"])
+    rows += outcome(batch, drives, alone)
     if given.timed:
-        print_efficiency(drives[:: max(1, len(drives) // given.timed)][: given.timed], given.out)
+        rows += efficiency(drives[:: max(1, len(drives) // given.timed)][: given.timed], given.out)
     if given.on_dask:
         some = [drive for drive in drives if int(drive.name[1:3]) in given.on_dask]
         command = batch_command(linked(some, given.out / "some"), given.out / "dask", dask="local")
         killed = kill_at_random(command, batches=0, mark=DASK_WORKER)
-        print(f"| on Dask: drives, workers killed | {len(some)}, {killed.drives} |")
-        print_outcome(given.out / "dask", some, alone)
+        rows.append(["on Dask: drives, workers killed", f"{len(some)}, {killed.drives}"])
+        rows += outcome(given.out / "dask", some, alone)
+    print(table("| what | found |", rows))
 
 
-def print_outcome(batch: Path, drives: Sequence[Path], alone: Path) -> None:
+def outcome(batch: Path, drives: Sequence[Path], alone: Path) -> list[list[str]]:
     """Rows of a table: what a batch left, beside what ``calibrate`` made of each drive."""
     with open(batch / "vehicles.csv", newline="") as stream:
         vehicles = list(csv.DictReader(stream))
     with open(batch / "summary.csv", newline="") as stream:
         rows = list(csv.DictReader(stream))
     counts = Counter(row["status"] for row in rows).most_common()
-    print(f"| status | {', '.join(f'{count} {status}' for status, count in counts)} |")
     there = sum((batch / "drives" / drive.name).is_dir() for drive in drives)
-    print(f"| results there | {there} of {len(drives)} |")
-    print(f"| most attempts at a drive | {max(int(row['attempts']) for row in rows)} |")
     differ = sum(len(unlike(alone / drive.name, batch / "drives" / drive.name)) for drive in drives)
-    print(f"| files unlike those of the sequential run | {differ} |")
-    for row in vehicles:
-        if row["status"] != "ok":
-            print(f"| {row['vehicle']} | {row['reason']} |")
-    print(f"| vehicles not accused | {sum(row['status'] == 'ok' for row in vehicles)} |", flush=True)
+    return [
+        ["status", ", ".join(f"{count} {status}" for status, count in counts)],
+        ["results there", f"{there} of {len(drives)}"],
+        ["most attempts at a drive", str(max(int(row["attempts"]) for row in rows))],
+        ["files unlike those of the sequential run", str(differ)],
+        *([row["vehicle"], row["reason"]] for row in vehicles if row["status"] != "ok"),
+        ["vehicles not accused", str(sum(row["status"] == "ok" for row in vehicles))],
+    ]
 
 
-def print_efficiency(drives: Sequence[Path], out: Path) -> None:
+def efficiency(drives: Sequence[Path], out: Path) -> list[list[str]]:
     """Rows of a table: what drives take one by one, and by a batch without kills."""
     for name in ("timed", "timed_one"):
         shutil.rmtree(out / name, ignore_errors=True)
     one_by_one = calibrate_one_by_one(drives, out / "timed_one")
     _, wall_s, cpu_s = run_batch(batch_command(linked(drives, out / "some"), out / "timed"))
     alone_s, alone_cpu_s = np.sum(one_by_one, axis=0)
-    print(f"| {len(drives)} drives one by one: wall, processor | {alone_s:.0f} s, {alone_cpu_s:.0f} s |")
-    print(f"| the same by batch on 2 workers: wall, processor | {wall_s:.0f} s, {cpu_s:.0f} s |")
-    efficiency = f"{alone_s / (2.0 * wall_s):.2f}, {alone_cpu_s / cpu_s:.2f}"
-    print(f"| efficiency: wall, processor | {efficiency} |", flush=True)
+    return [
+        [f"{len(drives)} drives one by one: wall, processor", f"{alone_s:.0f} s, {alone_cpu_s:.0f} s"],
+        ["the same by batch on 2 workers: wall, processor", f"{wall_s:.0f} s, {cpu_s:.0f} s"],
+        ["efficiency: wall, processor", f"{alone_s / (2.0 * wall_s):.2f}, {alone_cpu_s / cpu_s:.2f}"],
+    ]
 
 
 def linked(drives: Sequence[Path], folder: Path) -> Path:

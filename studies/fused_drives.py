@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import cv2
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from sst_graph.batch import calibrate_prepared, prepare_drives
 from sst_graph.errors import ContradictionError
+from sst_graph.experiments.markdown import NONE, table
 from sst_graph.export import CalibrationMarginal, Common, fuse_marginals, marginal_of_result
 from sst_graph.types import Calibration
 from studies.small_streets import CONFIG, FIRST_SEED, drawn, street
@@ -82,12 +83,19 @@ def main() -> None:
         apart.append(outcome([replace(part, common=Common()) for part in parts]))
         print(f"vehicle {vehicle}: {together[-1]} {apart[-1]}", file=sys.stderr, flush=True)
     print(f"\n{len(together)} vehicles, {used} drives\n")
-    print("| | NEES / dimension: mean, median, largest | refused |\n|---|---|---|")
-    print(f"| drives by themselves | {np.mean(single):.2f}, {np.median(single):.2f}, {max(single):.1f} | – |")
-    for name, found in (("fused", together), ("fused, apart", apart)):
-        values = [one for one, _ in found]
-        numbers = f"{np.mean(values):.2f}, {np.median(values):.2f}, {max(values):.1f}"
-        print(f"| {name} | {numbers} | {sum(refused for _, refused in found)} |")
+    print(table_of(single, {"fused": together, "fused, apart": apart}))
+
+
+def table_of(single: Sequence[float], fused: Mapping[str, Sequence[tuple[float, bool]]]) -> str:
+    """NEES of drives by themselves, and by name NEES of fused ones and whether fusion refuses them."""
+    rows = [["drives by themselves", _of_values(single), NONE]]
+    for name, found in fused.items():
+        rows.append([name, _of_values([one for one, _ in found]), str(sum(refused for _, refused in found))])
+    return table("| | mean, median, largest | vehicles refused as contradicting |", rows)
+
+
+def _of_values(values: Sequence[float]) -> str:
+    return f"{np.mean(values):.2f}, {np.median(values):.2f}, {max(values):.1f}"
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ an estimate, for in so few frames hardly one is confirmed.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -26,6 +26,7 @@ from sst_graph import CalibrationConfig, Tracker, TrackerConfig
 from sst_graph.batch.calibrate import finished, joint_method, prepare_drives
 from sst_graph.covariance.image_shifts import ImageShifts, image_shifts
 from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.experiments.markdown import lines
 from sst_graph.experiments.starts import error_of
 from sst_graph.odometry.sweep import with_sweep
 from sst_graph.types import Guess
@@ -34,6 +35,10 @@ from studies.subtle_faults import with_numbered_images
 
 FloatArray = NDArray[np.float64]
 STREETS = (*(f"own-{seed}" for seed in range(600, 604)), *(f"third-{seed}" for seed in range(610, 614)))
+HEAD = (
+    "| pictures [px], stamps [ms] | by | ok | found across, down [px], stamps [ms] "
+    "| NEES (of 7) without, with the shifts in the covariance | worst error without, with |"
+)
 CASES = ((0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (0.0, 10.0))
 """Deviation of the pictures, up or down [px], and of the stamps [ms]."""
 
@@ -114,8 +119,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("names", nargs="*", default=STREETS)
     names = parser.parse_args().names
-    print("| pictures [px], stamps [ms] | by | ok | found across, down [px], stamps [ms] | NEES | worst |")
-    print("|---|---|---|---|---|---|")
+    for line in lines(HEAD, rows(names)):
+        print(line, flush=True)
+
+
+def rows(names: Sequence[str]) -> Iterator[list[str]]:
+    """Each case, by both ways."""
     for pixels, milliseconds in CASES:
         by_all, by_tracker = [], []
         for name in names:
@@ -127,23 +136,23 @@ def main() -> None:
             start = source.truth.cTl.retract(start_step(name))
             by_all.append(outcome_of(drive, start))
             by_tracker += filter(None, [tracked(drive, start)])
-        print(_row(pixels, milliseconds, "calibrate", by_all, [one for one in by_all if one.status == "ok"]))
-        print(_row(pixels, milliseconds, "tracker", by_tracker, by_tracker), flush=True)
+        case = f"{pixels:g}, {milliseconds:g}"
+        yield [case, "calibrate", *_cells(by_all, [one for one in by_all if one.status == "ok"])]
+        yield [case, "tracker", *_cells(by_tracker, by_tracker)]
 
 
-def _row(
-    pixels: float, milliseconds: float, by: str, outcomes: Sequence[Outcome], counted: Sequence[Outcome]
-) -> str:
+def _cells(outcomes: Sequence[Outcome], counted: Sequence[Outcome]) -> list[str]:
     """counted: those whose errors are."""
     ok = sum(one.status == "ok" for one in outcomes)
     across, down, late_ms = np.median([one.found for one in outcomes], axis=0)
     nees = np.median([one.nees for one in counted], axis=0)
     worst = np.max([one.worst for one in counted], axis=0)
-    return (
-        f"| {pixels:g}, {milliseconds:g} | {by} | {ok} of {len(outcomes)} | "
-        f"{across:.2f}, {down:.2f}, {late_ms:.1f} | {nees[0]:.1f}, {nees[1]:.1f} | "
-        f"{worst[0]:.1f}, {worst[1]:.1f} σ |"
-    )
+    return [
+        f"{ok} of {len(outcomes)}",
+        f"{across:.2f}, {down:.2f}, {late_ms:.1f}",
+        f"{nees[0]:.1f}, {nees[1]:.1f}",
+        f"{worst[0]:.1f}, {worst[1]:.1f} σ",
+    ]
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import argparse
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.experiments.markdown import lines
 from sst_graph.fleet import Record
 from sst_graph.fleet.vehicles.changes import Findings, find_changes
 from sst_graph.fleet.vehicles.walk import DriveEstimate, WalkConfig
@@ -91,7 +92,13 @@ def main() -> None:
     parser.add_argument("batch", type=Path, help="--out of sst-graph batch")
     vehicles, config = estimates_in(parser.parse_args().batch), WalkConfig()
     drives = sum(map(len, vehicles.values()))
-    print(f"{len(vehicles)} vehicles, {drives} drives\n\n| step | found | found, apart |\n|---|---|---|")
+    print(f"{len(vehicles)} vehicles, {drives} drives\n")
+    for line in lines("| step | found | found, apart |", rows(vehicles, config)):
+        print(line, flush=True)
+
+
+def rows(vehicles: Mapping[str, Sequence[DriveEstimate]], config: WalkConfig) -> Iterator[list[str]]:
+    """How often a step of each size is found, with what drives have in common and without."""
     rng = np.random.default_rng(0)
     orders = [shuffled(own, rng) for own in vehicles.values() for _ in range(SHUFFLED)]
     alarms = [
@@ -100,7 +107,7 @@ def main() -> None:
         )
         for some in (orders, [apart(order) for order in orders])
     ]
-    print(f"| none | {alarms[0]} of {len(orders)} | {alarms[1]} of {len(orders)} |")
+    yield ["none", *(f"{count} of {len(orders)}" for count in alarms)]
     for name, axes, size in STEPS:
         cases = []
         for own in vehicles.values():
@@ -113,7 +120,7 @@ def main() -> None:
             sum(is_found(find_changes(change(drives), config), at, drives) for at, drives in cases)
             for change in (list, apart)
         ]
-        print(f"| {name} | {hits[0]} of {len(cases)} | {hits[1]} of {len(cases)} |", flush=True)
+        yield [name, *(f"{count} of {len(cases)}" for count in hits)]
 
 
 if __name__ == "__main__":

@@ -2,18 +2,21 @@
 
     OMP_NUM_THREADS=1 python studies/wrong_input.py --seeds 201 202
     OMP_NUM_THREADS=1 python studies/wrong_input.py --drive DATA --faults "Tr inverted" clean
-    OMP_NUM_THREADS=1 python studies/wrong_input.py --seeds 431 --frames 40 --subtle
+    OMP_NUM_THREADS=1 python studies/wrong_input.py --subtle --seeds 431 --frames 40
+    OMP_NUM_THREADS=1 python studies/wrong_input.py --subtle --drive DATA --methods joint edges
 
 Streets have 30 frames (--frames) of 621x188 px, and start from the pose that the data bring. --quick leaves
 the solution out where something is certain before it: the status is then never ok. --subtle: faults that
-leave a drive plausible; wrong is a result that is ok and more than 3 sigma off on an axis, the truth of a
-real drive being known to 0.1 deg, 1 cm and 5 ms. Real drives start 1.5 deg and 5 cm off then.
+leave a drive plausible, with a column for each drive and method: status, error, sigmas on the worst axis, and
+in bold what is ok and more than 3 of them off, the truth of a real drive being known to 0.1 deg, 1 cm and
+5 ms. Real drives are whole and start 1.5 deg and 5 cm off then. What is said first goes to stderr.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,7 +38,8 @@ from sst_graph.types import Guess
 
 CLEAN, RIGHT = "clean", "right camera"
 HEAD = "| drive | mistake | as it should be | status | error of the answer | said first |"
-SUBTLE_HEAD = "| drive | fault | as it should be | status | error | sigmas | said first |"
+SHORT = {"not_converged": "n.c.", "unobservable": "un."}
+"""Statuses in the cells of subtle faults."""
 MOST_SIGMAS = 3.0
 REFERENCE = TruthSigma(0.1, 0.01, 0.005)
 """Of the published calibrations of real drives."""
@@ -72,8 +76,8 @@ def row(name: str, drive: KeptDrive, quick: bool) -> tuple[Sequence[str], bool]:
     return (result.status, error_text, first), named
 
 
-def subtle_row(name: str, drive: KeptDrive, method: Method, real: bool) -> tuple[Sequence[str], bool]:
-    """Cells of the table of faults that leave a drive plausible, and whether the result can be believed.
+def subtle_cell(name: str, drive: KeptDrive, method: Method, real: bool) -> tuple[str, bool]:
+    """What a fault that leaves a drive plausible comes to, and whether the result can be believed.
 
     Args:
         real: its truth is a reference that is not exact.
@@ -81,33 +85,51 @@ def subtle_row(name: str, drive: KeptDrive, method: Method, real: bool) -> tuple
     try:
         result = calibrate(drive, drive.nominal, CalibrationConfig(method=method))
     except SstGraphError as error:
-        return ("refused", "", "", str(error)), True
+        print(f"{name}: {error}", file=sys.stderr, flush=True)
+        return "refused", True
     first = result.reasons[0] if result.reasons else ""
+    print(f"{name}: {first}", file=sys.stderr, flush=True)
     assert drive.truth is not None
     late_s = result.time_offset_s - (drive.truth.time_offset_s or 0.0)
     error = tangent_error(result.T_camera_lidar, drive.truth.cTl, late_s)
     covariance = result.covariance + real * REFERENCE.covariance
     sigmas = float((np.abs(error) / np.sqrt(np.diag(covariance))).max())
     sizes = (
-        f"{np.degrees(np.linalg.norm(error[:3])):.2f} deg, {100.0 * np.linalg.norm(error[3:6]):.1f} cm, "
-        f"{1e3 * abs(late_s):.1f} ms"
+        f"{np.degrees(np.linalg.norm(error[:3])):.2f}°, {100.0 * np.linalg.norm(error[3:6]):.1f} cm, "
+        f"{1e3 * abs(late_s):.1f} ms, {sigmas:.1f} σ"
     )
+    status = SHORT.get(result.status, result.status)
+    if name in SUBTLE_NAMED and SUBTLE_NAMED[name] in first:
+        status += ", named"
     believed = result.status != "ok" or sigmas <= MOST_SIGMAS
     believed = believed and SUBTLE_NAMED.get(name, "") in first
-    return (result.status, sizes, f"{sigmas:.1f}", first), believed
+    return f"{status if believed else f'**{status}**'}, {sizes}", believed
 
 
-def subtle_rows(args: argparse.Namespace, right: list[bool]) -> Iterator[Sequence[str]]:
-    """Rows of faults that leave a drive plausible; whether each is as it should be goes to ``right``."""
+def subtle_columns(args: argparse.Namespace) -> dict[str, tuple[KeptDrive, Method, bool]]:
+    """Drive, method, and whether its truth is a reference, by the column's head."""
+    found = {}
     for name, drive, _, _ in drives(args):
         real = name not in map(str, args.seeds)
         if real and drive.truth is not None:
             drive = replace(drive, nominal=drive.truth.cTl.retract(START))
-        for fault in args.faults or (CLEAN, *SUBTLE_FAULTS):
+        for method in args.methods:
+            found[f"{method}, `{name}`" if real else f"{method}, street {name}"] = drive, method, real
+    return found
+
+
+def subtle_rows(
+    args: argparse.Namespace, columns: Mapping[str, tuple[KeptDrive, Method, bool]], right: list[bool]
+) -> Iterator[Sequence[str]]:
+    """A row for each fault that leaves a drive plausible; whether each can be believed goes to ``right``."""
+    for fault in args.faults or (CLEAN, *SUBTLE_FAULTS):
+        cells = []
+        for drive, method, real in columns.values():
             wrong = drive if fault == CLEAN else SUBTLE_FAULTS[fault](drive)
-            cells, believed = subtle_row(fault, wrong, args.method, real)
+            cell, believed = subtle_cell(fault, wrong, method, real)
             right.append(believed)
-            yield name, fault, "yes" if believed else "**no**", *cells
+            cells.append(cell)
+        yield fault, *cells
 
 
 def rows(args: argparse.Namespace, right: list[bool]) -> Iterator[Sequence[str]]:
@@ -127,7 +149,7 @@ def rows(args: argparse.Namespace, right: list[bool]) -> Iterator[Sequence[str]]
 
 def drives(args: argparse.Namespace) -> Iterator[tuple[str, KeptDrive, KeptDrive, KeptDrive | None]]:
     """Name, drive, another drive of the same size, and the drive by the right camera where it can be had."""
-    some = f":{args.frames}"
+    some = None if args.subtle else f":{args.frames}"
     other = KeptDrive.of(open_source(args.other, frames=some), sweep="auto") if args.other else None
     for path in args.drive:
         source = open_source(path, image_shift=args.image_shift, frames=some)
@@ -148,7 +170,9 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=30)
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--subtle", action="store_true", help="faults that leave a drive plausible")
-    parser.add_argument("--method", default="joint", help="of --subtle: joint or edges")
+    parser.add_argument(
+        "--methods", nargs="+", default=["joint"], choices=["joint", "edges"], help="of --subtle"
+    )
     parser.add_argument("--faults", nargs="*", default=[])
     args = parser.parse_args()
     known = (CLEAN, *SUBTLE_FAULTS) if args.subtle else (CLEAN, *INPUT_FAULTS, RIGHT)
@@ -157,8 +181,12 @@ def main() -> None:
     if not args.subtle and not args.faults:
         args.faults = list(known)
     right: list[bool] = []
-    head, found = (SUBTLE_HEAD, subtle_rows) if args.subtle else (HEAD, rows)
-    for line in lines(head, found(args, right)):
+    if args.subtle:
+        columns = subtle_columns(args)
+        found = lines(f"| fault | {' | '.join(columns)} |", subtle_rows(args, columns, right))
+    else:
+        found = lines(HEAD, rows(args, right))
+    for line in found:
         print(line, flush=True)
     print(f"\n{sum(right)} of {len(right)} are as they should be.")
 

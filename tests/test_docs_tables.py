@@ -24,11 +24,11 @@ def test_pages_have_such_tables() -> None:
 
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: f"{table.page.stem}-{table.command[:60]}")
-def test_a_table_stands_below_its_command_and_above_its_version(table: make_tables.Table) -> None:
+def test_a_table_stands_below_its_command(table: make_tables.Table) -> None:
     text = table.page.read_text(encoding="utf-8")
     (block,) = (one for one in make_tables.BLOCK.finditer(text) if one["command"] == table.command)
     assert block["body"].startswith(f"```\n{table.command}\n```\n\n") and "|---|" in block["body"]
-    assert re.fullmatch(r"[0-9a-f]{7,12}", table.commit)
+    assert re.fullmatch(r"([0-9a-f]{7,12})?", table.commit)  # none: of unknown code
     words = shlex.split(table.command)
     if words[0] == "sst-graph":
         build_parser().parse_args(words[1:])

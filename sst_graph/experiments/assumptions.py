@@ -187,7 +187,8 @@ def _calibrated(
 def table(runs: Sequence[AssumptionRun], in_sigmas: bool = False) -> str:
     """The table of some runs, with a summary below.
 
-    A row holds the runs of one size, or with ``in_sigmas`` those of one size over its deviation.
+    A row holds the runs of one size; with ``in_sigmas`` those of one assumption, in a column for each size
+    over its deviation.
 
     A size in sigmas is in units of the deviation that its parameter would have as a variable on that street.
     "Silent" runs are ``ok`` and more than three sigmas off on an axis.
@@ -198,12 +199,41 @@ def table(runs: Sequence[AssumptionRun], in_sigmas: bool = False) -> str:
         if one.case == CLEAN
         for name, (_, sigma) in one.estimates.items()
     }
+    if in_sigmas:
+        return "\n".join([_by_size(runs, sigmas), *_summary(runs, sigmas)]) + "\n"
     rows: dict[tuple[str, float], list[AssumptionRun]] = {}
     for one in runs:
-        size = round(_in_sigmas(one, sigmas), 6) if in_sigmas and one.size else abs(one.size)
-        rows.setdefault((one.case, size), []).append(one)
+        rows.setdefault((one.case, abs(one.size)), []).append(one)
     cells = (_row(case, some, sigmas) for (case, _), some in rows.items())
     return "\n".join([markdown.table(_HEADER, cells), *_summary(runs, sigmas)]) + "\n"
+
+
+def _by_size(runs: Sequence[AssumptionRun], sigmas: Mapping[tuple[int, str], float]) -> str:
+    """A row for each assumption, with its deviations, and a column for each size."""
+    broken = [one for one in runs if one.size]
+    sizes = sorted({round(_in_sigmas(one, sigmas), 6) for one in broken})
+    rows = []
+    for case in dict.fromkeys(one.case for one in broken):
+        own = [one for one in broken if one.case == case]
+        deviations = (sigmas[seed, case] for seed in dict.fromkeys(one.seed for one in own))
+        cells = ([one for one in own if round(_in_sigmas(one, sigmas), 6) == size] for size in sizes)
+        rows.append([f"`{case}`", ", ".join(f"{one:.2g}" for one in deviations), *map(_counts, cells)])
+    return markdown.table(f"| broken | σ | {' | '.join(f'± {size:g} σ' for size in sizes)} |", rows)
+
+
+def _counts(runs: Sequence[AssumptionRun]) -> str:
+    """Contradicted, named first, not ok and silent, of all; median and mean NEES over its dimension."""
+    if not runs:
+        return markdown.NONE
+    counts = (
+        sum(bool(one.contradicted) for one in runs),
+        sum(one.contradicted[:1] == (one.case,) for one in runs),
+        sum(one.status != "ok" for one in runs),
+        sum(one.silent for one in runs),
+    )
+    normalised = [one.nees for one in runs]
+    figures = f"{np.median(normalised):.2g}, {np.mean(normalised):.2g}"
+    return f"{', '.join(map(str, counts))} of {len(runs)}; {figures}"
 
 
 _HEADER = (

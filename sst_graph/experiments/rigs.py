@@ -13,6 +13,7 @@ import numpy as np
 from sst_graph.batch import CalibrationConfig
 from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import Progress
+from sst_graph.experiments.markdown import table
 from sst_graph.experiments.starts import error_of
 from sst_graph.metrics import nees
 from sst_graph.rig.adjustment import adjusted
@@ -171,20 +172,18 @@ def _between(street: _Street, c: int, b: int) -> tuple[float, float]:
 _SCALES = np.array([np.degrees(1.0), 100.0, 1000.0])
 
 
-def _sizes(errors: Sequence[FloatArray]) -> str:
+def _sizes(errors: Sequence[FloatArray]) -> list[str]:
     """Medians of rotation [deg], translation [cm] and time offset [ms], their lengths."""
     lengths = np.array([[np.linalg.norm(e[:3]), np.linalg.norm(e[3:6]), abs(e[6])] for e in errors])
     rotation, translation, late = np.median(lengths, axis=0) * _SCALES
-    return f"{rotation:.3f} | {translation:.2f} | {late:.2f}"
+    return [f"{rotation:.3f}", f"{translation:.2f}", f"{late:.2f}"]
 
 
-_HEAD = (
-    "| {} | rotation [deg] | translation [cm] | time offset [ms] | NEES / 7 | {} |\n|---|---|---|---|---|---|"
-)
+_HEAD = "| {} | rotation [deg] | translation [cm] | time offset [ms] | NEES / 7 | ok |"
 
 
 def _stereo_tables(streets: Sequence[_Street]) -> str:
-    rows = [_HEAD.format("camera, estimate", "ok")]
+    rows = []
     weaker = [int(np.trace(_block(s.own, 1)[:6, :6]) > np.trace(_block(s.own, 0)[:6, :6])) for s in streets]
     for title, of_weaker in (("better known camera", False), ("weaker camera", True)):
         chosen = [w if of_weaker else 1 - w for w in weaker]
@@ -200,22 +199,22 @@ def _stereo_tables(streets: Sequence[_Street]) -> str:
                 nees.append(_nees(errors[-1], _block(marginal, k)))
             ok = sum(street.statuses[k] == "ok" for street, k in zip(streets, chosen, strict=True))
             counted = f"{ok} of {len(streets)}" if name == "own" else ""
-            rows.append(f"| {title}, {words} | {_sizes(errors)} | {np.mean(nees):.2f} | {counted} |")
-    return "\n".join([*rows, "", *_joint_table(streets, [(1, 0)])]) + "\n"
+            rows.append([f"{title}, {words}", *_sizes(errors), f"{np.mean(nees):.2f}", counted])
+    return f"{table(_HEAD.format('camera, estimate'), rows)}\n{_joint_table(streets, [(1, 0)])}"
 
 
 def _surround_tables(streets: Sequence[_Street]) -> str:
-    rows = [_HEAD.format("camera", "ok")]
+    rows = []
     for k, name in enumerate(streets[0].own.names):
         errors = [_errors(street.own, street.truths)[k] for street in streets]
         nees = [_nees(e, _block(s.own, k)) for e, s in zip(errors, streets, strict=True)]
         ok = sum(street.statuses[k] == "ok" for street in streets)
-        rows.append(f"| {name} | {_sizes(errors)} | {np.mean(nees):.2f} | {ok} of {len(streets)} |")
+        rows.append([name, *_sizes(errors), f"{np.mean(nees):.2f}", f"{ok} of {len(streets)}"])
     neighbours = [(k + 1, k) for k in range(len(streets[0].own.names) - 1)]
-    return "\n".join([*rows, "", *_joint_table(streets, neighbours)]) + "\n"
+    return f"{table(_HEAD.format('camera'), rows)}\n{_joint_table(streets, neighbours)}"
 
 
-def _joint_table(streets: Sequence[_Street], pairs: Sequence[tuple[int, int]]) -> list[str]:
+def _joint_table(streets: Sequence[_Street], pairs: Sequence[tuple[int, int]]) -> str:
     joint = np.mean([_joint_nees(street) for street in streets], axis=0)
     between = np.mean([_between(street, c, b) for street in streets for c, b in pairs], axis=0)
     ratio = np.nanmedian([all_s / alone_s for (all_s, alone_s) in (street.seconds for street in streets)])
@@ -224,13 +223,12 @@ def _joint_table(streets: Sequence[_Street], pairs: Sequence[tuple[int, int]]) -
         f"{kind} {np.median([street.correlations[kind] for street in streets]):.2f}" for kind in kinds
     )
     size = UNKNOWNS * len(streets[0].own.names)
-    return [
-        "| figure | mean |",
-        "|---|---|",
-        f"| NEES / {size} of all cameras, joint covariance | {joint[0]:.2f} |",
-        f"| the same as if the cameras were independent | {joint[1]:.2f} |",
-        f"| NEES / 6 of the poses between neighbours | {between[0]:.2f} |",
-        f"| NEES / 1 of the differences of their time offsets | {between[1]:.2f} |",
-        f"| correlation of errors in common (median) | {alike} |",
-        f"| time of all cameras over that of the first alone (first street) | {ratio:.1f} |",
+    rows = [
+        [f"NEES / {size} of all cameras, joint covariance", f"{joint[0]:.2f}"],
+        ["the same as if the cameras were independent", f"{joint[1]:.2f}"],
+        ["NEES / 6 of the poses between neighbours", f"{between[0]:.2f}"],
+        ["NEES / 1 of the differences of their time offsets", f"{between[1]:.2f}"],
+        ["correlation of errors in common (median)", alike],
+        ["time of all cameras over that of the first alone (first street)", f"{ratio:.1f}"],
     ]
+    return table("| figure | mean |", rows)

@@ -17,6 +17,7 @@ import numpy as np
 
 from sst_graph.batch import CalibrationConfig, calibrate
 from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.experiments.markdown import lines
 from sst_graph.metrics import CalibrationErrors, calibration_errors
 from sst_graph.segmentation import (
     ImageSegmenter,
@@ -36,6 +37,7 @@ HALF_SIZE = {
     "azimuth_limit_deg": 50.0,
     "vehicle_density": 0.3,
 }
+HEAD = "| street | labels | IoU masks | IoU points | rotation deg | ATD cm | time ms | status |"
 FIRST_TRAINED, FIRST_TRIED = 700, 800
 """Seeds of the streets that the networks are fitted to, and of those that they are tried on."""
 
@@ -59,11 +61,10 @@ def main() -> None:
         write_image_network(streets, folder, fit)
         write_scan_network(streets, folder, fit)
     images, scans = open_image_segmenter(folder / "image.yaml"), open_scan_segmenter(folder / "scan.yaml")
-    print("| street | labels | IoU masks | IoU points | rotation deg | ATD cm | time ms | status |")
-    print("|---|---|---|---|---|---|---|---|")
-    for k in range(args.streets):
-        for line in tried(FIRST_TRIED + k, args.frames, images, scans):
-            print(line, flush=True)
+    seeds = range(FIRST_TRIED, FIRST_TRIED + args.streets)
+    rows = (row for seed in seeds for row in tried(seed, args.frames, images, scans))
+    for line in lines(HEAD, rows):
+        print(line, flush=True)
 
 
 def trained_street(seed: int) -> KeptDrive:
@@ -72,7 +73,7 @@ def trained_street(seed: int) -> KeptDrive:
     return KeptDrive.of(simulate(config))
 
 
-def tried(seed: int, frames: int, images: ImageSegmenter, scans: ScanSegmenter) -> list[str]:
+def tried(seed: int, frames: int, images: ImageSegmenter, scans: ScanSegmenter) -> list[list[str]]:
     """Rows of the table for a street."""
     config = SimulationConfig(seed=seed, frames=frames, label_noise=0.0, time_offset_s=0.1, **HALF_SIZE)
     street = KeptDrive.of(simulate(config))
@@ -86,12 +87,12 @@ def tried(seed: int, frames: int, images: ImageSegmenter, scans: ScanSegmenter) 
         both = drives["networks for both"]
         masks = overlap([f.image.mask for f in both if f.image], [f.image.mask for f in street if f.image])
         points = overlap([f.scan.classes for f in both if f.scan], [f.scan.classes for f in street if f.scan])
-        lines = []
+        rows = []
         for name, drive in drives.items():
             of_masks = masks if "masks" in name or "both" in name else 1.0
             of_points = points if "points" in name or "both" in name else 1.0
-            lines.append(f"| {seed} | {name} | {of_masks:.2f} | {of_points:.2f} | {_calibrated(drive)} |")
-        return lines
+            rows.append([str(seed), name, f"{of_masks:.2f}", f"{of_points:.2f}", *_calibrated(drive)])
+        return rows
 
 
 def overlap(found: Sequence[np.ndarray], exact: Sequence[np.ndarray]) -> float:
@@ -100,12 +101,12 @@ def overlap(found: Sequence[np.ndarray], exact: Sequence[np.ndarray]) -> float:
     return float((a & b).sum() / max(1, (a | b).sum()))
 
 
-def _calibrated(drive: Source) -> str:
+def _calibrated(drive: Source) -> list[str]:
     result = calibrate(drive, drive.nominal, CalibrationConfig())
     assert drive.truth is not None
     errors: CalibrationErrors = calibration_errors(result.T_camera_lidar, result.time_offset_s, drive.truth)
     time_ms = 1e3 * (errors.time_offset_s or 0.0)
-    return f"{errors.qad_deg:.3f} | {100 * errors.atd_m:.2f} | {time_ms:+.1f} | {result.status}"
+    return [f"{errors.qad_deg:.3f}", f"{100 * errors.atd_m:.2f}", f"{time_ms:+.1f}", result.status]
 
 
 if __name__ == "__main__":

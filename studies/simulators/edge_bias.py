@@ -1,7 +1,6 @@
-"""Where boundary points lie beside exact contours, at the true extrinsic, by side and range. Prints a table.
+"""Where boundary points lie beside exact contours, at the true extrinsic, by simulator and side: a table.
 
-    OMP_NUM_THREADS=1 python studies/simulators/edge_bias.py --simulator third --streets 40
-    OMP_NUM_THREADS=1 python studies/simulators/edge_bias.py --simulator third --streets 40 --option rays=1
+    OMP_NUM_THREADS=1 python studies/simulators/edge_bias.py --streets 40
 
 One standing frame a street, vehicles only. Distances are robust means (Geman-McClure, 3 px) in pixels,
 positive outside of the contour, and their deviations by object. What sides have in common is taken up by the
@@ -11,8 +10,7 @@ mask bias of each object; a top that differs from the sides by 1 px tilts the ca
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
-from itertools import pairwise
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -23,6 +21,7 @@ from second_street import SecondStreet, StreetConfig
 from third_street import ThirdConfig, ThirdStreet
 
 from sst_graph.association.edge_matching import SIDE_OF
+from sst_graph.experiments.markdown import NONE, lines
 from sst_graph.features.lidar_edges import find_boundaries
 from sst_graph.features.mask_contour import ContourMap
 from sst_graph.simulator import SimulationConfig, simulate
@@ -32,8 +31,9 @@ FloatArray = NDArray[np.float64]
 
 SIMULATORS: dict[str, Callable[..., Source]] = {
     "first": lambda **options: simulate(SimulationConfig(**options)),
-    "second": lambda **options: SecondStreet(StreetConfig(**{"density": 0.2, **options})),
-    "third": lambda **options: ThirdStreet(ThirdConfig(**options)),
+    "second": lambda **options: SecondStreet(StreetConfig(density=0.2, **options)),
+    "third, ideal rays": lambda **options: ThirdStreet(ThirdConfig(rays=1, **options)),
+    "third, beams of 2 mrad": lambda **options: ThirdStreet(ThirdConfig(**options)),
 }
 STANDING = {
     "frames": 1,
@@ -43,18 +43,17 @@ STANDING = {
     "moving_fraction": 0.0,
 }
 SIDES = ("left", "right", "top", "bottom")
-RANGES_M = (0.0, 8.0, 14.0, 24.0, 60.0)
 _KERNEL_PX, _FARTHEST_PX, _LEAST_COSINE = 3.0, 9.0, 0.5
 
 
 def edges(source: Source) -> FloatArray:
-    """(n, 4) object, side, range [m], signed distance [px] of the vehicles' boundary points."""
+    """(n, 3) object, side, signed distance [px] of the vehicles' boundary points."""
     frame, truth = source[0], source.truth
     assert frame.scan is not None and frame.image is not None and truth is not None
     found = find_boundaries(frame.scan, [SemanticClass.VEHICLE])
     contour = ContourMap.of(frame.image.mask, SemanticClass.VEHICLE)
     if not found or contour is None:
-        return np.zeros((0, 4))
+        return np.zeros((0, 3))
     points = found[SemanticClass.VEHICLE]
     R, t = truth.cTl.rotation().matrix(), truth.cTl.translation()
     uvs, outs = (source.camera.project(lPs @ R.T + t) for lPs in (points.lPs, points.outward))
@@ -63,14 +62,13 @@ def edges(source: Source) -> FloatArray:
     cosine = (way * feet.normals).sum(axis=1) / np.maximum(np.linalg.norm(way, axis=1), 1e-9)
     ok = feet.valid & (cosine > _LEAST_COSINE) & (np.abs(feet.distances) < _FARTHEST_PX)
     sides = SIDE_OF[points.edges, (way[:, 0] > 0).astype(np.intp)]
-    ranges = np.linalg.norm(points.lPs, axis=1)
-    return np.asarray(np.stack([points.objects, sides, ranges, feet.distances], axis=1)[ok])
+    return np.asarray(np.stack([points.objects, sides, feet.distances], axis=1)[ok])
 
 
 def robust_mean(distances: FloatArray, objects: FloatArray) -> str:
     """Mean and its deviation over objects."""
     if len(distances) < 30:
-        return "–"
+        return NONE
     mean = float(np.median(distances))
     for _ in range(20):
         weights = 1.0 / (1.0 + ((distances - mean) / _KERNEL_PX) ** 2) ** 2
@@ -80,30 +78,26 @@ def robust_mean(distances: FloatArray, objects: FloatArray) -> str:
     return f"{mean:+.2f} ± {np.sqrt(sums @ sums) / weights.sum():.2f}"
 
 
+def row(simulator: str, seeds: Sequence[int]) -> list[str]:
+    """A simulator's means by side."""
+    rows = []
+    for seed in seeds:
+        found = edges(SIMULATORS[simulator](seed=seed, **STANDING))
+        rows.append(found + np.array([1000.0 * seed, 0.0, 0.0]))
+    points = np.concatenate(rows)
+    own = (points[points[:, 1] == side] for side in range(len(SIDES)))
+    return [simulator, *(robust_mean(some[:, 2], some[:, 0]) for some in own)]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--simulator", choices=sorted(SIMULATORS), default="third")
     parser.add_argument("--streets", type=int, default=40)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--option", action="append", default=[], help="NAME=NUMBER of the simulator")
     args = parser.parse_args()
     cv2.setNumThreads(1)
-    options = {}
-    for name, number in (each.split("=") for each in args.option):
-        options[name] = float(number) if "." in number else int(number)
-    rows = []
-    for seed in range(args.seed, args.seed + args.streets):
-        found = edges(SIMULATORS[args.simulator](seed=seed, **STANDING, **options))
-        rows.append(found + np.array([1000.0 * seed, 0.0, 0.0, 0.0]))
-    table = np.concatenate(rows)
-    spans = list(pairwise(RANGES_M))
-    print("| side | points | all [px] | " + " | ".join(f"{a:.0f} to {b:.0f} m" for a, b in spans) + " |")
-    print("|---" * (3 + len(spans)) + "|")
-    for side, name in enumerate(SIDES):
-        own = table[table[:, 1] == side]
-        parts = [own[(own[:, 2] >= a) & (own[:, 2] < b)] for a, b in spans]
-        cells = [robust_mean(part[:, 3], part[:, 0]) for part in (own, *parts)]
-        print(f"| {name} | {len(own)} | " + " | ".join(cells) + " |")
+    seeds = range(args.seed, args.seed + args.streets)
+    for line in lines(f"| | {' | '.join(SIDES)} |", (row(simulator, seeds) for simulator in SIMULATORS)):
+        print(line, flush=True)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ Starts are uniform within 12 deg by axis and 10 cm; ``--init none`` gives none.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import cv2
@@ -20,9 +20,14 @@ from second_street import SecondStreet, StreetConfig
 from third_street import ThirdConfig, ThirdStreet
 
 from sst_graph import CalibrationConfig, calibrate
+from sst_graph.experiments.markdown import lines, median_worst, status_counts
 from sst_graph.experiments.starts import error_of
 from sst_graph.types import SemanticClass
 
+HEAD = (
+    "| scenario | off by more than 1° (`ok`) | rotation [deg] | ATD [cm] | time offset [ms] "
+    "| NEES / dimension: rotation, translation, time offset, all | ok / unobservable / not converged |"
+)
 Street = SecondStreet | ThirdStreet
 SIMULATORS: dict[str, Callable[..., Street]] = {
     "second": lambda **options: SecondStreet(StreetConfig(**options)),
@@ -72,13 +77,12 @@ def main() -> None:
     parser.add_argument("--scenario", action="append", choices=sorted(SCENARIOS))
     args = parser.parse_args()
     cv2.setNumThreads(1)
-    head = ("scenario", "off by > 1 deg (status ok)", "rotation [deg]", "ATD [cm]", "time offset [ms]")
-    print(
-        "| "
-        + " | ".join((*head, "NEES / dimension: r, t, d, all", "ok / unobservable / not converged"))
-        + " |"
-    )
-    print("|---" * 7 + "|")
+    for line in lines(HEAD, rows(args)):
+        print(line, flush=True)
+
+
+def rows(args: argparse.Namespace) -> Iterator[list[str]]:
+    """A row for each scenario: median and largest, over streets."""
     for name in args.scenario or SCENARIOS:
         figures, statuses = [], []
         for seed in range(args.seed, args.seed + args.streets):
@@ -89,12 +93,10 @@ def main() -> None:
         table = np.array(figures)
         lost = table[:, 0] > 1.0
         silent = sum(status == "ok" for status, wrong in zip(statuses, lost, strict=True) if wrong)
-        cells = [name, f"{lost.sum()} ({silent}) of {len(lost)}"]
-        cells += [f"{np.median(c):.3f} / {c.max():.3f}" for c in table.T[:1]]
-        cells += [f"{np.median(c):.2f} / {c.max():.2f}" for c in table.T[1:3]]
+        cells = [name, f"{lost.sum()} ({silent}) of {len(lost)}", median_worst(list(table[:, 0]), 3)]
+        cells += [median_worst(list(column), 2) for column in table.T[1:3]]
         cells.append(", ".join(f"{mean:.1f}" for mean in table[:, 3:].mean(axis=0)))
-        cells.append(" / ".join(str(statuses.count(s)) for s in ("ok", "unobservable", "not_converged")))
-        print("| " + " | ".join(cells) + " |", flush=True)
+        yield [*cells, status_counts(statuses)]
 
 
 if __name__ == "__main__":
