@@ -59,8 +59,10 @@ def source_of(name: str) -> Source:
 
 
 def start_step(name: str) -> FloatArray:
-    """(6,) from the truth to the start: the same for a name each time."""
-    rng = np.random.default_rng([sum((i + 1) * ord(c) for i, c in enumerate(name)), 0])
+    """(6,) from the truth to the start: the same for a street or a drive's folder each time, wherever it
+    lies."""
+    own = Path(name).name
+    rng = np.random.default_rng([sum((i + 1) * ord(c) for i, c in enumerate(own)), 0])
     return np.r_[np.radians(rng.uniform(-5.0, 5.0, 3) * np.sqrt(0.75)), rng.uniform(-0.1, 0.1, 3)]
 
 

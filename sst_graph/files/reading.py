@@ -16,7 +16,7 @@ import os
 import stat
 import tomllib
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BufferedReader
@@ -278,6 +278,21 @@ def _require_regular(status: os.stat_result, path: str | Path, kind: FileKind) -
         raise DataError(path, _KINDS.get(stat.S_IFMT(status.st_mode), "no regular file"), kind.name)
     if status.st_size > kind.max_bytes:
         raise _too_large(path, status.st_size, kind)
+
+
+def refuse_special(paths: Iterable[Path], expected: str) -> None:
+    """Refuse what is there and neither a regular file nor a folder: another library would wait for it.
+
+    Raises:
+        DataError: a FIFO, a socket or a device.
+    """
+    for path in paths:
+        try:
+            kind = stat.S_IFMT(os.stat(path).st_mode)
+        except (OSError, ValueError):  # missing: said where it is read
+            continue
+        if kind not in (stat.S_IFREG, stat.S_IFDIR):
+            raise DataError(path, _KINDS.get(kind, "no regular file"), expected)
 
 
 def _too_large(path: str | Path, size: int, kind: FileKind) -> DataError:

@@ -192,6 +192,11 @@ def _attribute(node: Any, name: str) -> Any:
     return next(pair for pair in node[2][1] if pair[0] == name)
 
 
+def _forget(node: Any, name: str) -> None:
+    """Without an attribute of an object's node."""
+    node[2][1].remove(_attribute(node, name))
+
+
 def _inputs(tracker: Any) -> Any:
     """The node of a tracker's inputs."""
     return _attribute(tracker, "inputs")[1]
@@ -226,6 +231,7 @@ def _inputs(tracker: Any) -> Any:
             1, "late"
         ),
         lambda tracker: _attribute(_attribute(tracker, "setup")[1], "camera").__setitem__(1, None),
+        lambda tracker: _forget(_attribute(_inputs(tracker), "window")[1], "next_scan"),
     ],
 )
 def test_a_forged_tracker_is_refused(tmp_path: Path, good: bytes, change: Callable[[Any], Any]) -> None:

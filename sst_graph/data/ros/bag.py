@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sst_graph.data.ros.livox import CUSTOM, OLDER_CUSTOM, custom_points
 from sst_graph.errors import DataError, SstGraphError, count_of, one_line, optional_module
-from sst_graph.files.reading import MAX_DIGITS
+from sst_graph.files.reading import MAX_DIGITS, refuse_special
 
 WHOLE_BAG = (
     "a whole ROS 1 bag, rosbag2 folder or mcap file; one that was cut short is repaired with "
@@ -84,6 +84,7 @@ class Bag:
         self.is_ros1 = self.path.suffix == ".bag"
         without = f"{self.path}: reading bags needs rosbags, which is not installed"
         rosbags = optional_module(f"rosbags.rosbag{1 if self.is_ros1 else 2}", without, "ros")
+        refuse_special([self.path, *self.path.glob("*")], "a bag")
         stack = ExitStack()
         try:
             self._reader: Any = rosbags.Reader(self.path)

@@ -323,8 +323,8 @@ def _tracker(document: dict[str, Any], data: memoryview, path: str | Path) -> Tr
 
 
 def _check_tracker(tracker: Tracker, path: str | Path) -> None:
-    """Require a tracker that gives its estimate and accepts its last frame once more: its parts are
-    consistent.
+    """Require a tracker that gives its estimate and its result, and accepts its last frame once more: its
+    parts are consistent.
 
     Raises:
         CheckpointError: it does not, whatever it raises; a file may hold any contradiction.
@@ -337,6 +337,7 @@ def _check_tracker(tracker: Tracker, path: str | Path) -> None:
         consolidate(tracker)
         _repeat_last_frame(tracker)
         current_update(tracker).to_dict()
+        tracker.result().to_json()
         stored(tracker)
     except Exception as error:
         found = f"a tracker that gives no estimate ({type(error).__name__}: {error})"

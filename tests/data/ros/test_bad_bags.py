@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import sys
@@ -348,6 +349,18 @@ def test_an_mcap_file_of_other_messages_than_those_of_ros_2(
     other = tmp_path / "other.mcap"
     other.write_bytes(data[:21] + b"ros1" + data[25:])
     assert "found MCAP of profile 'ros1', expected profile 'ros2'" in refused(capsys, other)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_fifo_in_the_place_of_a_file_is_not_waited_for(
+    kind: Kind, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = made(tmp_path, fill, kind=kind)
+    file = path if kind == "ros1" else files_of(path, ".mcap" if kind == "mcap" else ".db3")[0]
+    file.unlink()
+    os.mkfifo(file)
+    said = "no layout that is known" if kind == "ros1" else "a FIFO, expected a bag"
+    assert f"{file}: found {said}" in refused(capsys, path)
 
 
 def test_what_is_no_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
