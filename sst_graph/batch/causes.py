@@ -11,6 +11,7 @@ from sst_graph.batch.by_edges.inverted import inverted_start
 from sst_graph.batch.by_edges.label_parts import split_by_labels
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.covariance.considered import AssumptionConfig
+from sst_graph.data.info.facts import facts_of
 from sst_graph.diagnosis import (
     Finding,
     Fitter,
@@ -81,7 +82,8 @@ def with_causes(
         inverted = inverted_start(by_edges, guess, config)
         causes = [] if inverted is None else [inverted.sentence]
     if estimated:
-        remarks = (remark.sentence for remark in _remarks(result, drives, config))
+        of_estimate = (remark.sentence for remark in _remarks(result, drives, config))
+        remarks = (*_of_data(drives), *of_estimate)
         result = replace(result, reasons=(*result.reasons, *remarks))
     if causes:
         status = "not_converged" if estimated else result.status
@@ -95,6 +97,12 @@ def _wrong_sweeps(drives: Sequence[Drive]) -> list[str]:
     """A sentence for each drive whose scans contradict what was said of their sweep."""
     sweeps = [(drive.name, drive.sweep) for drive in drives if drive.sweep is not None]
     return [f"{name}: {sweep.contradiction}" for name, sweep in sweeps if sweep.contradiction]
+
+
+def _of_data(drives: Sequence[Drive]) -> list[str]:
+    """What the data of each drive have to say of themselves with every result."""
+    read = [(drive.name, facts_of(drive.frames.source)) for drive in drives if drive.frames is not None]
+    return [f"{name}: {remark}" for name, facts in read if facts is not None for remark in facts.remarks]
 
 
 def _with_unlabelled_frames(

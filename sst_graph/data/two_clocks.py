@@ -59,6 +59,7 @@ class DriveProperties:
         sweep, sweep_stamp: as :class:`~sst_graph.data.source.SourceOptions` has them.
         nominal_reason: where the nominal extrinsic comes from, or why there is none.
         notes: sentences on what else was found.
+        remarks: such that concern every result of the drive.
     """
 
     name: str
@@ -70,6 +71,7 @@ class DriveProperties:
     sweep_stamp: SweepStamp = "forward"
     nominal_reason: str = ""
     notes: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -220,6 +222,7 @@ class TwoClockSource(IndexedSource):
             SensorFacts(self.images.place, self.images.stamps_ns[images], self.images.topic),
             self.properties.nominal_reason,
             self.properties.notes,
+            self.properties.remarks,
         )
 
     def read_scan(self, position: int) -> Scan | None:
