@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Literal
 
 from sst_graph.assumptions import held_at_zero
 from sst_graph.batch.by_edges.inverted import inverted_start
@@ -68,6 +69,8 @@ def with_causes(
     found = preflight(drives, guess, config.classes if by_labels else ())
     causes = [*_wrong_sweeps(drives), *(finding.sentence for finding in found)]
     estimated = bool(result.frames_used)
+    if not causes and result.status != "ok":
+        causes = _of_data(drives, "doubts")
     if not causes and result.status != "ok" and config.method != "motion":
         axes = other_axes(drives)
         causes = [] if axes is None else [axes.sentence]
@@ -83,7 +86,7 @@ def with_causes(
         causes = [] if inverted is None else [inverted.sentence]
     if estimated:
         of_estimate = (remark.sentence for remark in _remarks(result, drives, config))
-        remarks = (*_of_data(drives), *of_estimate)
+        remarks = (*_of_data(drives, "remarks"), *of_estimate)
         result = replace(result, reasons=(*result.reasons, *remarks))
     if causes:
         status = "not_converged" if estimated else result.status
@@ -99,10 +102,10 @@ def _wrong_sweeps(drives: Sequence[Drive]) -> list[str]:
     return [f"{name}: {sweep.contradiction}" for name, sweep in sweeps if sweep.contradiction]
 
 
-def _of_data(drives: Sequence[Drive]) -> list[str]:
-    """What the data of each drive have to say of themselves with every result."""
+def _of_data(drives: Sequence[Drive], what: Literal["remarks", "doubts"]) -> list[str]:
+    """What the data of each drive have to say of themselves: a field of their facts."""
     read = [(drive.name, facts_of(drive.frames.source)) for drive in drives if drive.frames is not None]
-    return [f"{name}: {remark}" for name, facts in read if facts is not None for remark in facts.remarks]
+    return [f"{name}: {one}" for name, facts in read if facts is not None for one in getattr(facts, what)]
 
 
 def _with_unlabelled_frames(

@@ -60,6 +60,7 @@ class DriveProperties:
         nominal_reason: where the nominal extrinsic comes from, or why there is none.
         notes: sentences on what else was found.
         remarks: such that concern every result of the drive.
+        doubts: what may be wrong with the data: first reasons of a result that is not ok.
     """
 
     name: str
@@ -72,6 +73,7 @@ class DriveProperties:
     nominal_reason: str = ""
     notes: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -223,6 +225,7 @@ class TwoClockSource(IndexedSource):
             self.properties.nominal_reason,
             self.properties.notes,
             self.properties.remarks,
+            self.properties.doubts,
         )
 
     def read_scan(self, position: int) -> Scan | None:

@@ -38,6 +38,7 @@ class SourceFacts:
         nominal: where the nominal extrinsic comes from, or why there is none.
         notes: sentences on what else was found.
         remarks: such that concern every result of the drive.
+        doubts: what may be wrong with the data: first reasons of a result that is not ok.
     """
 
     scan: SensorFacts
@@ -45,6 +46,7 @@ class SourceFacts:
     nominal: str = ""
     notes: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
 
 
 def facts_of(source: Source) -> SourceFacts | None:

@@ -25,6 +25,7 @@ from sst_graph.data.ros.frames import CloudReading, check_size, mask_classes, sc
 from sst_graph.data.ros.images import mask_of, picture_of
 from sst_graph.data.ros.index import BagIndex, Stamped, read_index
 from sst_graph.data.ros.link_frame import LINK_AXES, is_link, of_optical_axes
+from sst_graph.data.ros.moving_frame import check_moves_along
 from sst_graph.data.ros.topics import Topics, choose_topics
 from sst_graph.data.source import Loader, SourceOptions
 from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
@@ -152,6 +153,9 @@ def open_ros(path: Path, options: SourceOptions) -> Source:
     topics = choose_topics(path, bag.topics, options)
     index = read_index(bag, topics, options.stamps)
     _check_masks(bag, index)
+    of_frame = check_moves_along(
+        index.cloud_frame, index.image_frame, index.transforms, f"{path}, {topics.cloud.name}"
+    )
     size = _size(bag, topics, index)
     geometry = _geometry(path, topics, index, size, options)
     oTl, reason = _extrinsic(bag, topics, index, geometry)
@@ -179,6 +183,7 @@ def open_ros(path: Path, options: SourceOptions) -> Source:
         nominal_reason=reason,
         notes=tuple(notes),
         remarks=(of_clock,) * bool(of_clock),
+        doubts=(of_frame,) * bool(of_frame),
     )
     scans = Sensor(_stamps(index.clouds), messages.scan, _place_of(topics.cloud), topics.cloud.name)
     images = Sensor(_stamps(index.images), messages.image, _place_of(topics.image), topics.image.name)

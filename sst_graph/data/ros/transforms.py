@@ -92,6 +92,14 @@ class Transforms:
             seen.add(frame)
         return frame
 
+    def moves(self, one: str, other: str) -> bool:
+        """Whether a frame moves against another, by the chain that joins them; where none does, whether it
+        moves against any frame that it has a transform with."""
+        path = self._path(one, other) if one != other else None
+        if path is None:
+            return any(one in edge for edge in self._moving)
+        return any(edge in self._moving or edge[::-1] in self._moving for edge in pairwise(path))
+
     def pose(self, parent: str, child: str) -> tuple[gtsam.Pose3 | None, str]:
         """Pose of ``child`` in ``parent``, or None, and why: missing, moving, ambiguous or none."""
         if parent == child:
