@@ -33,7 +33,7 @@ from sst_graph.types import CameraImage, Scan, Source, with_intensities
 _LOG = logging.getLogger(__name__)
 
 LAYOUT = "a folder with images, clouds, camera.yaml; stamps as names or in images.csv, clouds.csv"
-PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 _IMAGES, _CLOUDS, _CAMERA, _EXTRINSIC = "images", "clouds", "camera.yaml", "extrinsic.yaml"
 _DEFAULT_CAMERA, _DEFAULT_CLOUD = SourceOptions().camera, SourceOptions().cloud
 
