@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -200,7 +201,8 @@ def test_a_broken_drive_ends_a_command_with_2(
         ("folder", {"camera": "left"}, "cameras images: none is .left."),
         ("nuscenes", {}, "2 scenes .scene-0061, scene-0103.: name one of them .--sequence."),
         ("nuscenes", {"sequence": "7"}, "none is '7'"),
-        ("nuscenes", {"sequence": "61", "camera": "CAM_LEFT"}, "has CAM_BACK, CAM_FRONT"),
+        ("nuscenes", {"sequence": "61", "camera": "CAM_LEFT"}, "has CAM_BACK, CAM_FRONT .--camera."),
+        ("nuscenes", {"sequence": "61", "cloud": "LIDAR_LEFT"}, "has LIDAR_TOP .--cloud."),
     ],
 )
 def test_options_that_a_layout_has_not(
@@ -289,6 +291,25 @@ def test_an_extrinsic_as_translation_and_quaternion(folder: Path) -> None:
     )
     (folder / "extrinsic.yaml").unlink()
     assert open_source(folder).nominal is None
+
+
+@pytest.mark.parametrize("channel", ["LIDAR_TOP", "LIDAR_LEFT"])
+def test_the_lidars_of_a_nuscenes_tree(nuscenes: Path, channel: str) -> None:
+    """The only one is taken, whatever its name; of two the usual one, or the one that is named."""
+    table = nuscenes / "v1.0-mini/sensor.json"
+    sensors = json.loads(table.read_text().replace("LIDAR_TOP", channel))
+    table.write_text(json.dumps(sensors))
+    count = sum(frame.scan is not None for frame in open_source(nuscenes, sequence="61"))
+    assert count == 5
+    sensors.append({"token": "s-2", "channel": "LIDAR_REAR", "modality": "lidar"})
+    table.write_text(json.dumps(sensors))
+    named = open_source(nuscenes, sequence="61", cloud=channel)
+    assert sum(frame.scan is not None for frame in named) == count
+    with pytest.raises(DataError, match="0 calibrations of LIDAR_REAR in the scene"):
+        open_source(nuscenes, sequence="61", cloud="LIDAR_REAR")
+    if channel != "LIDAR_TOP":
+        with pytest.raises(ConfigError, match=r"no lidar is named: .* has LIDAR_LEFT, LIDAR_REAR .--cloud."):
+            open_source(nuscenes, sequence="61")
 
 
 def test_stamps_in_a_table_and_files_that_are_not_in_it(folder: Path) -> None:

@@ -46,7 +46,9 @@ def add_source_options(command: argparse.ArgumentParser, several_cameras: bool =
         )
     else:
         source.add_argument("--camera", metavar="NAME", help=named)
-    source.add_argument("--cloud", help=f"folder of the scans (default {SOURCE_DEFAULTS['cloud']})")
+    source.add_argument(
+        "--cloud", help=f"folder of the scans (default {SOURCE_DEFAULTS['cloud']}), or a LiDAR of nuScenes"
+    )
     source.add_argument(
         "--lidar-pose",
         metavar="X,Y,Z[,ROLL,PITCH,YAW]",
