@@ -159,7 +159,7 @@ def _clock(scans: Sequence[ScanTimes], unit_ns: int, stamp: SweepStamp) -> tuple
         level = float(np.quantile(lasts - drift * passed, 1.0 - _NEAR_THE_END))
     clock = PointClock(unit_ns, since_ns, since_ns + base_ns + round(level * 1e9), drift)
     ahead_s = (clock.reads_ns - since_ns) * 1e-9
-    facts = f"{abs(ahead_s):.3f} s {'ahead of' if ahead_s > 0.0 else 'behind'} it"
+    facts = f"{abs(ahead_s):.3f} s {'ahead of' if ahead_s > 0.0 else 'behind'} them"
     facts += f", drift {1e6 * drift:.1f} ppm" if drift else ""
     facts += f", jitter {1e3 * jitter_s:.1f} ms"
     convention = f"a stamp counts as the {named} of its sweep (--sweep-stamp start or end)"

@@ -130,7 +130,7 @@ def test_times_of_another_clock_are_those_after_the_stamp(
     named = "end" if driver.later_s else "start"
     assert f"a stamp counts as the {named} of its sweep" in remarks(tmp_path / "own")
     assert "of another clock than the stamps (1699994999." in remarks(tmp_path / "own")
-    assert "s behind it" in remarks(tmp_path / "own")
+    assert "s behind them" in remarks(tmp_path / "own")
     assert remarks(tmp_path / "relative") == remarks(tmp_path / "own", sweep="compensated") == ""
 
 
@@ -189,7 +189,7 @@ def test_clouds_in_files(kitti_drive: Path, tmp_path: Path) -> None:
         assert frame.scan is not None and frame.scan.offsets_s is not None
         np.testing.assert_allclose(frame.scan.offsets_s, after_s, atol=2e-6)
     facts = facts_of(open_source(folder))
-    assert facts is not None and "1000000000.000 s behind it" in facts.remarks[0]
+    assert facts is not None and "1000000000.000 s behind them" in facts.remarks[0]
 
 
 SWEEP = np.linspace(0.0, 0.1, 200)
