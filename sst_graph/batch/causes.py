@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Literal
 
 from sst_graph.assumptions import held_at_zero
 from sst_graph.batch.by_edges.inverted import inverted_start
 from sst_graph.batch.by_edges.label_parts import split_by_labels
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.covariance.considered import AssumptionConfig
+from sst_graph.data.info.facts import facts_of
 from sst_graph.diagnosis import (
     Finding,
     Fitter,
@@ -67,6 +69,8 @@ def with_causes(
     found = preflight(drives, guess, config.classes if by_labels else ())
     causes = [*_wrong_sweeps(drives), *(finding.sentence for finding in found)]
     estimated = bool(result.frames_used)
+    if not causes and result.status != "ok":
+        causes = _of_data(drives, "doubts")
     if not causes and result.status != "ok" and config.method != "motion":
         axes = other_axes(drives)
         causes = [] if axes is None else [axes.sentence]
@@ -81,7 +85,8 @@ def with_causes(
         inverted = inverted_start(by_edges, guess, config)
         causes = [] if inverted is None else [inverted.sentence]
     if estimated:
-        remarks = (remark.sentence for remark in _remarks(result, drives, config))
+        of_estimate = (remark.sentence for remark in _remarks(result, drives, config))
+        remarks = (*_of_data(drives, "remarks"), *of_estimate)
         result = replace(result, reasons=(*result.reasons, *remarks))
     if causes:
         status = "not_converged" if estimated else result.status
@@ -95,6 +100,12 @@ def _wrong_sweeps(drives: Sequence[Drive]) -> list[str]:
     """A sentence for each drive whose scans contradict what was said of their sweep."""
     sweeps = [(drive.name, drive.sweep) for drive in drives if drive.sweep is not None]
     return [f"{name}: {sweep.contradiction}" for name, sweep in sweeps if sweep.contradiction]
+
+
+def _of_data(drives: Sequence[Drive], what: Literal["remarks", "doubts"]) -> list[str]:
+    """What the data of each drive have to say of themselves: a field of their facts."""
+    read = [(drive.name, facts_of(drive.frames.source)) for drive in drives if drive.frames is not None]
+    return [f"{name}: {one}" for name, facts in read if facts is not None for one in getattr(facts, what)]
 
 
 def _with_unlabelled_frames(

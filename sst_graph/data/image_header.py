@@ -1,4 +1,4 @@
-"""Width and height of a PNG, JPEG or TIFF file by its header, and whether the file is whole.
+"""Width and height of a PNG, JPEG, TIFF, BMP or WebP file by its header, and whether the file is whole.
 
 A TIFF file is known by its first directory; source: TIFF Revision 6.0 (Adobe, 1992). Pictures of 8 or 16 bits
 with up to four channels are read.
@@ -11,6 +11,7 @@ import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
+from sst_graph.data.length_header import bmp_or_webp_size, check_declared_length, is_bmp_or_webp
 from sst_graph.errors import DataError, count_of
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -23,10 +24,10 @@ _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
 
 
 def image_size(data: bytes, path: str | Path) -> tuple[int, int]:
-    """Width and height [px] that a PNG, JPEG or TIFF file declares.
+    """Width and height [px] that a PNG, JPEG, TIFF, BMP or WebP file declares.
 
     Raises:
-        DataError: neither of them, or without a header that says so.
+        DataError: none of them, or without a header that says so.
     """
     if data.startswith(PNG):
         width, height = _png_size(data, path)
@@ -34,8 +35,11 @@ def image_size(data: bytes, path: str | Path) -> tuple[int, int]:
         width, height = _jpeg_size(data, path)
     elif data.startswith(TIFF):
         width, height = tiff_size(data, path)
+    elif is_bmp_or_webp(data):
+        width, height = bmp_or_webp_size(data, path)
     else:
-        raise DataError(path, f"first bytes {data[:4]!r} of {len(data)}", "a PNG, JPEG or TIFF file")
+        expected = "a PNG, JPEG, TIFF, BMP or WebP file"
+        raise DataError(path, f"first bytes {data[:4]!r} of {len(data)}", expected)
     if width == 0 or height == 0:
         raise DataError(path, f"a size of {width}x{height} px", "a picture with pixels")
     return width, height
@@ -51,6 +55,8 @@ def check_whole(data: bytes, path: str | Path) -> None:
         _check_png_chunks(data, path)
     elif data.startswith(TIFF):
         check_tiff_whole(data, path)
+    elif is_bmp_or_webp(data):
+        check_declared_length(data, path)
     else:
         _check_jpeg_end(data, path)
 

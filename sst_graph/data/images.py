@@ -18,7 +18,7 @@ from sst_graph.data.image_header import JPEG, check_whole, image_size
 from sst_graph.errors import DataError
 from sst_graph.files.reading import FileKind, read_file
 
-IMAGE = FileKind("a PNG, JPEG or TIFF file", 128 * 1024 * 1024)
+IMAGE = FileKind("a PNG, JPEG, TIFF, BMP or WebP file", 128 * 1024 * 1024)
 
 MAX_PIXELS = 50_000_000
 """Pixels of an image; a picture of 8K video has 33 million. As 16-bit RGBA this many take 0.4 GB."""
@@ -35,7 +35,7 @@ _PADDING = "extraneous bytes before marker 0xd9"
 
 
 def picture_size(path: Path) -> Size:
-    """Width and height [px] by the header of a PNG, JPEG or TIFF file; nothing is decoded.
+    """Width and height [px] by the header of a PNG, JPEG, TIFF, BMP or WebP file; nothing is decoded.
 
     Raises:
         DataError: a missing file, none of these, or more than MAX_PIXELS.
@@ -44,7 +44,7 @@ def picture_size(path: Path) -> Size:
 
 
 def read_picture(path: Path, size: Size | None = None) -> NDArray[np.uint8]:
-    """Picture (h, w, 3) uint8 BGR of a PNG, JPEG or TIFF file, grey ones repeated in the channels.
+    """Picture (h, w, 3) uint8 BGR of a PNG, JPEG, TIFF, BMP or WebP file, grey ones repeated in the channels.
 
     Rows and columns are those of the sensor: an orientation tag is not followed, as intrinsics and masks do
     not follow it either.
@@ -141,10 +141,10 @@ def _decoded(data: bytes, flags: int, path: str | Path, size: Size | None) -> ND
         except cv2.error:
             image = None
     if image is None:
-        raise DataError(path, "an image that does not decode", "a whole PNG, JPEG or TIFF file")
+        raise DataError(path, "an image that does not decode", "a whole PNG, JPEG, TIFF, BMP or WebP file")
     damage = [line for line in complaints if _tells_damage(line)]
     if damage:
-        raise DataError(path, f"a damaged image ({damage[0]})", "a whole PNG, JPEG or TIFF file")
+        raise DataError(path, f"a damaged image ({damage[0]})", "a whole PNG, JPEG, TIFF, BMP or WebP file")
     decoded: NDArray[Any] = np.asarray(image)
     if decoded.shape[:2] != (height, width):
         found = f"{decoded.shape[1]}x{decoded.shape[0]} px"

@@ -39,7 +39,8 @@ def rings_from_order(points: NDArray[np.float32]) -> NDArray[np.uint16] | None:
     azimuth = np.arctan2(y, x)
     elevation = np.arctan2(points[:, 2], np.hypot(x, y)).astype(np.float64)
     steps = np.diff(azimuth)
-    if np.median(steps) < 0.0:
+    # Points that are there twice (two returns) have no sense of rotation.
+    if np.count_nonzero(steps < 0.0) > np.count_nonzero(steps > 0.0):
         azimuth, steps = -azimuth, -steps
     turned = np.cumsum(_modulo_turn(steps.astype(np.float64)))
     turned = np.maximum.accumulate(np.concatenate([[0.0], turned]))

@@ -61,7 +61,8 @@ class SourceOptions:
             "clockwise" (or "azimuth"), "counterclockwise": points as measured by a scanner that turns that
             way, seen from above; their times follow from their azimuths.
         sweep_start_deg: for these, the azimuth at which a turn begins, counter-clockwise from forward [deg].
-        sweep_stamp: the instant that a scan's stamp names where times follow from azimuths.
+        sweep_stamp: the instant that a scan's stamp names where times follow from azimuths, or are of another
+            clock.
         image_topic, cloud_topic, info_topic: of a bag: topics of the camera, the LiDAR and the camera model,
             or None for the only ones there.
         camera_file: of a bag: the camera in a YAML file, in the place of a CameraInfo.

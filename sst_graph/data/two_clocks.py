@@ -59,6 +59,8 @@ class DriveProperties:
         sweep, sweep_stamp: as :class:`~sst_graph.data.source.SourceOptions` has them.
         nominal_reason: where the nominal extrinsic comes from, or why there is none.
         notes: sentences on what else was found.
+        remarks: such that concern every result of the drive.
+        doubts: what may be wrong with the data: first reasons of a result that is not ok.
     """
 
     name: str
@@ -70,6 +72,8 @@ class DriveProperties:
     sweep_stamp: SweepStamp = "forward"
     nominal_reason: str = ""
     notes: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -220,6 +224,8 @@ class TwoClockSource(IndexedSource):
             SensorFacts(self.images.place, self.images.stamps_ns[images], self.images.topic),
             self.properties.nominal_reason,
             self.properties.notes,
+            self.properties.remarks,
+            self.properties.doubts,
         )
 
     def read_scan(self, position: int) -> Scan | None:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from sst_graph.cameras import Rectification
 from sst_graph.classes import MaskEncoding
@@ -20,8 +22,10 @@ from sst_graph.data.ros.camera_info import (
     image_geometry,
     is_other_camera,
 )
+from sst_graph.data.ros.clouds import cloud_of
 from sst_graph.data.ros.frames import CloudReading, check_size, mask_classes, scan_of
 from sst_graph.data.ros.images import picture_of
+from sst_graph.data.ros.link_frame import LINK_AXES, is_link, of_link_axes, of_optical_axes
 from sst_graph.data.ros.topics import CLOUD, COMPRESSED, IMAGE, INFO
 from sst_graph.data.ros.transforms import Transforms
 from sst_graph.data.source import TURNS
@@ -87,6 +91,7 @@ class CalibrationNode:
         self._other_infos = 0
         self._geometry: ImageGeometry | None = None
         self._rectification: Rectification | None = None
+        self._images_in_link = False
         self._transforms = Transforms()
         self._waiting_for = self._told = ""
 
@@ -298,9 +303,25 @@ class CalibrationNode:
         if not self.lidar.frame:
             return None, 0.0, "no cloud yet"
         oTl, why = self._transforms.pose(self.camera.frame, self.lidar.frame)
-        if oTl is not None and self._T_cloud_lidar is not None:
+        if oTl is None:
+            return None, 0.0, why
+        if (points := self._waiting_points()) is None:
+            return None, 0.0, "no cloud that can be used"
+        self._images_in_link = is_link(self.camera.frame, oTl, points, geometry.model)
+        if self._images_in_link:
+            oTl = of_optical_axes(oTl)
+        if self._T_cloud_lidar is not None:
             oTl = oTl * self._T_cloud_lidar
-        return (None if oTl is None else geometry.extrinsic(oTl)), 0.0, why
+        return geometry.extrinsic(oTl), 0.0, ""
+
+    def _waiting_points(self) -> NDArray[np.float32] | None:
+        """Points (n, 3) of the first cloud that waits and can be used [m]; what is wrong with others is said
+        when they are."""
+        for one in self._queue.peek():
+            if one.is_scan:
+                with suppress(Exception):
+                    return cloud_of(one.content, one.stamp_ns, self.lidar.topic, times=False).points
+        return None
 
     def _use(self, one: Waiting, now_ns: int) -> TrackUpdate | None:
         """Decode a message and give it to the tracker; its update, or None where it cannot be decoded."""
@@ -356,6 +377,8 @@ class CalibrationNode:
                 "restart the node if the camera changed"
             )
         values = {**camera.values, "other_camera_infos": others, "refused_camera_infos": info.refused}
+        if self._images_in_link:
+            values["axes"] = f"{self.camera.frame} shows to be the camera's link ({LINK_AXES})"
         if not words:
             return dataclasses.replace(camera, values=values)
         if camera.level != OK:
@@ -408,6 +431,8 @@ class CalibrationNode:
         # The frame of the images, which may be turned against that of the camera model.
         assert self._geometry is not None
         oTl = gtsam.Pose3(self._geometry.cRo, np.zeros(3)).inverse() * cTl
+        if self._images_in_link:
+            oTl = of_link_axes(oTl)
         if self._T_cloud_lidar is not None:
             oTl = oTl * self._T_cloud_lidar.inverse()  # The frame that the clouds' headers name.
         if self.settings.parent == "lidar":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -200,7 +201,8 @@ def test_a_broken_drive_ends_a_command_with_2(
         ("folder", {"camera": "left"}, "cameras images: none is .left."),
         ("nuscenes", {}, "2 scenes .scene-0061, scene-0103.: name one of them .--sequence."),
         ("nuscenes", {"sequence": "7"}, "none is '7'"),
-        ("nuscenes", {"sequence": "61", "camera": "CAM_LEFT"}, "has CAM_BACK, CAM_FRONT"),
+        ("nuscenes", {"sequence": "61", "camera": "CAM_LEFT"}, "has CAM_BACK, CAM_FRONT .--camera."),
+        ("nuscenes", {"sequence": "61", "cloud": "LIDAR_LEFT"}, "has LIDAR_TOP .--cloud."),
     ],
 )
 def test_options_that_a_layout_has_not(
@@ -291,6 +293,25 @@ def test_an_extrinsic_as_translation_and_quaternion(folder: Path) -> None:
     assert open_source(folder).nominal is None
 
 
+@pytest.mark.parametrize("channel", ["LIDAR_TOP", "LIDAR_LEFT"])
+def test_the_lidars_of_a_nuscenes_tree(nuscenes: Path, channel: str) -> None:
+    """The only one is taken, whatever its name; of two the usual one, or the one that is named."""
+    table = nuscenes / "v1.0-mini/sensor.json"
+    sensors = json.loads(table.read_text().replace("LIDAR_TOP", channel))
+    table.write_text(json.dumps(sensors))
+    count = sum(frame.scan is not None for frame in open_source(nuscenes, sequence="61"))
+    assert count == 5
+    sensors.append({"token": "s-2", "channel": "LIDAR_REAR", "modality": "lidar"})
+    table.write_text(json.dumps(sensors))
+    named = open_source(nuscenes, sequence="61", cloud=channel)
+    assert sum(frame.scan is not None for frame in named) == count
+    with pytest.raises(DataError, match="0 calibrations of LIDAR_REAR in the scene"):
+        open_source(nuscenes, sequence="61", cloud="LIDAR_REAR")
+    if channel != "LIDAR_TOP":
+        with pytest.raises(ConfigError, match=r"no lidar is named: .* has LIDAR_LEFT, LIDAR_REAR .--cloud."):
+            open_source(nuscenes, sequence="61")
+
+
 def test_stamps_in_a_table_and_files_that_are_not_in_it(folder: Path) -> None:
     names = sorted(path.name for path in (folder / "images").iterdir())[:3]
     lines = [f"{name},{7_000_000 + 50_000_000 * k}" for k, name in enumerate(names)]
@@ -319,6 +340,16 @@ def test_lines_whose_files_are_missing_are_left_out_and_counted(
         ("filename,timestamp", "{name},{seconds}"),
         ("", "{seconds},{name}"),
         ("", "{name},{ns}"),
+        ("", "{name};{ns}"),
+        ("name\tstamp", "{name}\t{seconds}"),
+        ("# timestamp filename", "{seconds} {name}"),  # TUM
+        ("# color images", "{seconds}   image/{name}"),
+        ("", "{name},{us}"),
+        ("", "{ms};{name}"),
+        ("name,sec,nsec", "{name},{sec},{nsec}"),
+        ("", "{sec} {nsec} {name}"),
+        ("seq,stamp,name,exposure", "{k},{ns},{name},0.012"),
+        ("", "{k};{sec};{nsec};{name}"),
     ],
 )
 def test_columns_in_either_order_and_stamps_in_either_unit(tmp_path: Path, heading: str, line: str) -> None:
@@ -330,11 +361,44 @@ def test_columns_in_either_order_and_stamps_in_either_unit(tmp_path: Path, headi
     for k, stamp in enumerate(stamps):
         name, seconds = f"{k:06d}.png", f"{stamp // 10**9}.{stamp % 10**9:09d}"
         (images / name).write_bytes(b"")
-        lines.append(line.format(ns=stamp, name=name, seconds=seconds))
+        sec, nsec = divmod(stamp, 10**9)
+        units = {"ns": stamp, "us": stamp // 1_000, "ms": stamp // 1_000_000, "sec": sec, "nsec": nsec}
+        lines.append(line.format(name=name, seconds=seconds, k=k, **units))
     (tmp_path / "images.csv").write_text("\n".join(lines) + "\n")
     files = stamped_files(images, (".png",))
     assert files.stamps_ns.tolist() == stamps
     assert [path.name for path in files.paths] == ["000000.png", "000001.png", "000002.png"]
+
+
+@pytest.mark.parametrize("form", ["{s}_{n:09d}", "{s}_{n}", "{s}_{u:06d}", "{us}", "{s}.{n:09d}"])
+def test_stamps_as_names(tmp_path: Path, form: str) -> None:
+    stamps = [1_700_000_000_000_000_000 + 33_333_000 * k for k in range(40)]
+    for stamp in stamps:
+        s, n = divmod(stamp, 10**9)
+        (tmp_path / f"{form.format(s=s, n=n, u=n // 1000, us=stamp // 1000)}.png").write_bytes(b"")
+    assert stamped_files(tmp_path, (".png",)).stamps_ns.tolist() == stamps
+
+
+@pytest.mark.parametrize("line", ["0.png,1,2,3", "0.png,1700000000.1,1700000000.2", "0.png,words,more"])
+def test_columns_that_do_not_show_which_the_stamp_is(tmp_path: Path, line: str) -> None:
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "0.png").write_bytes(b"")
+    (tmp_path / "images.csv").write_text(line + "\n")
+    with pytest.raises(DataError, match=r"images.csv:1: found .*, expected name,stamp or stamp,name"):
+        stamped_files(tmp_path / "images", (".png",))
+
+
+def test_a_camera_of_euroc(tmp_path: Path) -> None:
+    (tmp_path / "sensor.yaml").write_text(
+        "sensor_type: camera\ncomment: VI-Sensor cam0\nT_BS:\n  cols: 4\n  rows: 4\n  data: [1.0]\n"
+        "rate_hz: 20\nresolution: [752, 480]\ncamera_model: pinhole\n"
+        "intrinsics: [458.654, 457.296, 367.215, 248.375]\ndistortion_model: radial-tangential\n"
+        "distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]\n"
+    )
+    model = read_camera(tmp_path / "sensor.yaml")
+    assert isinstance(model, BrownConradyCamera)
+    assert (model.width, model.height, model.intrinsics.fx) == (752, 480, 458.654)
+    np.testing.assert_allclose(model.coefficients[:4], [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05])
 
 
 def test_a_table_with_quotes(tmp_path: Path) -> None:
@@ -371,7 +435,7 @@ def test_names_that_count_are_no_stamps(folder: Path) -> None:
         open_source(folder)
 
 
-@pytest.mark.parametrize("suffix", [".tif", ".jpg"])
+@pytest.mark.parametrize("suffix", [".tif", ".jpg", ".bmp", ".webp"])
 def test_pictures_of_other_formats(folder: Path, suffix: str) -> None:
     for path in (folder / "images").iterdir():
         cv2.imwrite(str(path.with_suffix(suffix)), cv2.imread(str(path)))

@@ -49,6 +49,14 @@ def test_beams_of_a_cropped_cloud_are_found(crop_deg: float) -> None:
     assert np.mean(rings != beams) < 0.005
 
 
+@pytest.mark.parametrize("clockwise", [False, True])
+def test_beams_of_points_that_are_there_twice_are_found(clockwise: bool) -> None:
+    """Two returns a firing, side by side."""
+    points, beams = spin(clockwise=clockwise)
+    rings = rings_from_order(np.repeat(points, 2, axis=0))
+    assert rings is not None and np.mean(rings != np.repeat(beams, 2)) < 0.002
+
+
 def test_other_orders_give_none() -> None:
     points, beams = spin()
     rng = np.random.default_rng(0)

@@ -25,6 +25,8 @@ from rosbags.highlevel import AnyReader
 
 import sst_graph.ros_node
 from sst_graph.cli import main
+from sst_graph.data import open_source
+from sst_graph.data.ros.link_frame import of_link_axes, of_optical_axes
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.ros_node import CalibrationNode, NodeSettings, Published
 from sst_graph.ros_node.settings import node_settings, parameter_defaults
@@ -160,6 +162,32 @@ def test_clouds_in_axes_of_the_vehicle(bag: Any, config: TrackerConfig) -> None:
     q, t = one.transform.rotation, one.transform.translation
     oTv = gtsam.Pose3(gtsam.Rot3.Quaternion(q.w, q.x, q.y, q.z), [t.x, t.y, t.z])
     np.testing.assert_allclose((oTv * T_vehicle_lidar).matrix(), cTl, atol=1e-8)
+
+
+def test_images_stamped_with_the_camera_s_link(bag: Any, config: TrackerConfig) -> None:
+    """The start is turned into the optical axes, and what is published is of the frame in the headers."""
+    make, messages = Messages(), []
+    cTl = open_source(bag, mask_topic=MASK).nominal
+    assert cTl is not None
+    for topic, kind, now_ns, message in _messages(bag)[:FEW]:
+        if topic == "/tf_static":
+            message = make.transforms({("camera_link", LIDAR_FRAME): of_link_axes(cTl)})
+        elif topic in (IMAGE, MASK):
+            header = dataclasses.replace(message.header, frame_id="camera_link")
+            message = dataclasses.replace(message, header=header)
+        messages.append((topic, kind, now_ns, message))
+    node = CalibrationNode(dataclasses.replace(SETTINGS, publish="latest"), config)
+    last = _play(node, messages)[-1]
+    plain = _play(CalibrationNode(SETTINGS, config), _messages(bag)[:FEW])[-1]
+    found, expected = (np.array(_line(one)["T_camera_lidar"]) for one in (last, plain))
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    (one,) = last.transforms.transforms
+    assert (one.header.frame_id, one.child_frame_id) == ("camera_link", LIDAR_FRAME)
+    q, t = one.transform.rotation, one.transform.translation
+    linkTl = gtsam.Pose3(gtsam.Rot3.Quaternion(q.w, q.x, q.y, q.z), [t.x, t.y, t.z])
+    np.testing.assert_allclose(of_optical_axes(linkTl).matrix(), found, atol=1e-8)
+    values = {one.key: one.value for one in _diagnostics(node, EPOCH_NS)["camera"].values}
+    assert values["axes"].startswith("camera_link shows to be the camera's link (x forward")
 
 
 def test_what_is_published_can_be_serialized(bag: Any, config: TrackerConfig) -> None:

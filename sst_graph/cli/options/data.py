@@ -46,7 +46,9 @@ def add_source_options(command: argparse.ArgumentParser, several_cameras: bool =
         )
     else:
         source.add_argument("--camera", metavar="NAME", help=named)
-    source.add_argument("--cloud", help=f"folder of the scans (default {SOURCE_DEFAULTS['cloud']})")
+    source.add_argument(
+        "--cloud", help=f"folder of the scans (default {SOURCE_DEFAULTS['cloud']}), or a LiDAR of nuScenes"
+    )
     source.add_argument(
         "--lidar-pose",
         metavar="X,Y,Z[,ROLL,PITCH,YAW]",
@@ -83,8 +85,9 @@ def add_source_options(command: argparse.ArgumentParser, several_cameras: bool =
     source.add_argument(
         "--sweep-stamp",
         choices=("forward", "start", "end"),
-        help="instant of a turn that a scan's stamp names, where times follow from azimuths: the laser faces "
-        "forward (default), the turn begins or ends; no data separate it from a time offset",
+        help="instant of a turn that a scan's stamp names, where times follow from azimuths (the laser faces "
+        "forward, default, the turn begins or ends) or are of another clock (start or end); no data "
+        "separate it from a time offset",
     )
     bag = command.add_argument_group("bags (docs/how-to/ros.md)")
     bag.add_argument(

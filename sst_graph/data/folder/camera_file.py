@@ -5,6 +5,7 @@ A camera is written in one of three ways:
 - plainly: fx, fy, cx, cy [px], width, height, and where the pictures are not rectified distortion_model and
   distortion;
 - as Kalibr's camchain: cam0 with camera_model, intrinsics, distortion_model, distortion_coeffs, resolution;
+  or one camera alone as EuRoC's sensor.yaml has it;
 - as OpenCV's or ROS's calibration: camera_matrix, image_width, image_height, distortion_coefficients; or
   the names that scripts and CameraInfo have for these, such as K, D, dist_coeffs, width, height, image_size.
 
@@ -46,6 +47,8 @@ _OPENCV = {
     "image_size": ("imagesize", "resolution"),
 }
 """OpenCV's names, and others for the same in small letters without underscores."""
+_EUROC = {"distortion_coefficients": "distortion_coeffs", "radial-tangential": "radtan"}
+"""EuRoC's names, and Kalibr's for the same."""
 _OF_DISTORTION = ("distortionmodel",)
 _ROUNDED = 1e-3
 """A quaternion's length differs from 1 by no more than its digits were rounded."""
@@ -71,6 +74,8 @@ def read_camera(path: Path, name: str = "") -> CameraModel:
         intrinsics = pinhole_camera((fx, fy, cx, cy), (width, height), path)
         coefficients = numbers(table.get("distortion") or [], f"{path} (distortion)")
         return camera_of(intrinsics, str(table.get("distortion_model", "none")), coefficients, path)
+    if "intrinsics" in table and "resolution" in table:
+        table = {"cam0": _of_kalibr(table)}
     chain = {str(key): value for key, value in table.items() if _IN_CHAIN.fullmatch(str(key))}
     if any(isinstance(value, dict) for value in chain.values()):
         key = _of_chain(chain, name, path)
@@ -80,6 +85,14 @@ def read_camera(path: Path, name: str = "") -> CameraModel:
         check_full_sensor(calibration, path)
         return camera_from_opencv({"distortion_coefficients": [], **calibration}, path)
     raise DataError(path, f"keys {', '.join(map(str, table))}"[:200], _EXPECTED)
+
+
+def _of_kalibr(table: Mapping[str, Any]) -> dict[str, Any]:
+    """EuRoC's entries of a camera by Kalibr's names."""
+    named = {_EUROC.get(str(key), str(key)): value for key, value in table.items()}
+    if named.get("distortion_model") in _EUROC:
+        named["distortion_model"] = _EUROC[named["distortion_model"]]
+    return named
 
 
 def _plain_key(key: object) -> str:

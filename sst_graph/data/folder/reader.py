@@ -23,16 +23,17 @@ from sst_graph.data.folder.camera_file import read_camera, read_extrinsic
 from sst_graph.data.folder.stamps import StampedFiles, stamped_files
 from sst_graph.data.pictures import PictureFiles, mask_encoding, point_labels
 from sst_graph.data.point_files import SUFFIXES, PointFields, read_cloud
+from sst_graph.data.point_times import PointClock, ScanTimes, clock_of_points
 from sst_graph.data.rectified import RectifiedSource
 from sst_graph.data.source import Loader, SourceOptions
 from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
-from sst_graph.errors import ConfigError, DataError, count_of, printable
+from sst_graph.errors import ConfigError, DataError, MissingDependencyError, count_of, printable
 from sst_graph.types import CameraImage, Scan, Source, with_intensities
 
 _LOG = logging.getLogger(__name__)
 
 LAYOUT = "a folder with images, clouds, camera.yaml; stamps as names or in images.csv, clouds.csv"
-PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 _IMAGES, _CLOUDS, _CAMERA, _EXTRINSIC = "images", "clouds", "camera.yaml", "extrinsic.yaml"
 _DEFAULT_CAMERA, _DEFAULT_CLOUD = SourceOptions().camera, SourceOptions().cloud
 
@@ -55,11 +56,13 @@ class CloudFiles:
         files: with their stamps.
         labels: paths of label files by position.
         stored_times: take the times that the clouds hold.
+        clock: of these; None: that of the stamps.
     """
 
     files: StampedFiles
     labels: dict[int, Path]
     stored_times: bool
+    clock: PointClock | None = None
 
     def scan(self, k: int) -> Scan:
         """Scan k; points that are NaN or inf are left out.
@@ -73,7 +76,7 @@ class CloudFiles:
         used: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
         classes, instances = self._labels(k, cloud, used)
         offsets_s = None
-        if self.stored_times and (times := cloud.offsets_s(stamp_ns, used)) is not None:
+        if self.stored_times and (times := cloud.offsets_s(stamp_ns, used, self.clock)) is not None:
             offsets_s = times[used]
         rings, intensities = cloud.rings(), cloud.intensities()
         points = np.ascontiguousarray(points[used])
@@ -123,22 +126,36 @@ def open_folder(path: Path, options: SourceOptions) -> Source:
     masks = _beside(images, own / "masks", (".png",))
     encoding = mask_encoding(masks, options.label_encoding, size)
     pictures = PictureFiles(size, dict(enumerate(images.paths)), masks, encoding)
-    scans = CloudFiles(
-        clouds,
-        _beside(clouds, path / "labels", (".label",)),
-        options.sweep == "auto",
-    )
+    clock, of_clock = _clock(clouds, options)
+    scans = CloudFiles(clouds, _beside(clouds, path / "labels", (".label",)), options.sweep == "auto", clock)
 
     def image(k: int) -> CameraImage:
         return pictures.image(k, int(images.stamps_ns[k]))
 
     reason = f"by {_EXTRINSIC}" if nominal is not None else f"no {_EXTRINSIC}"
     name = printable(path.resolve().name)
-    properties = DriveProperties(name, model.intrinsics, nominal, nominal_reason=reason)
+    remarks = (of_clock,) * bool(of_clock)
+    properties = DriveProperties(name, model.intrinsics, nominal, nominal_reason=reason, remarks=remarks)
     of_scans = Sensor(clouds.stamps_ns, scans.scan, _CLOUDS)
     of_images = Sensor(images.stamps_ns, image, _IMAGES)
     drive = merged(properties, of_scans, of_images, options, path)
     return drive if model.is_pinhole else RectifiedSource(drive, Rectification.of(model))
+
+
+def _clock(clouds: StampedFiles, options: SourceOptions) -> tuple[PointClock | None, str]:
+    """The clock of the points' times, where it is not that of the stamps, and a sentence on it."""
+    if options.sweep != "auto":
+        return None, ""
+
+    def read(k: int) -> ScanTimes | None:
+        try:
+            cloud = read_cloud(clouds.paths[k])
+            values, used = cloud.times(), np.isfinite(cloud.points()).all(axis=1)
+        except (DataError, MissingDependencyError):  # which the scan will raise when it is read
+            return None
+        return None if values is None else ScanTimes(int(clouds.stamps_ns[k]), values[used])
+
+    return clock_of_points(read, len(clouds.paths), options.sweep_stamp)
 
 
 def _check_options(path: Path, options: SourceOptions) -> None:

@@ -1,9 +1,13 @@
 """Stamps of files: in a CSV file beside them, or as their names.
 
-``images.csv`` beside ``images/``: one "name,stamp" a line, or "stamp,name" (EuRoC), quotes or none; a first
-line of words is a heading. A file without a line is left out, and so is a line whose file is missing. Names
-may have a path before them, or lack their ending. A stamp, here or as a name, is seconds with a decimal point
-("1317048145.963.png"), or whole nanoseconds ("1317048145963000000.png").
+``images.csv`` beside ``images/``: one "name,stamp" a line, or "stamp,name" (EuRoC), quotes or none, with
+commas, semicolons, tabs or blanks between; a first line of words is a heading, a line behind "#" a comment.
+Of more columns those of the name and of the stamp are taken, where they show. A file without a line is left
+out, and so is a line whose file is missing. Names may have a path before them, or lack their ending.
+
+A stamp, here or as a name, is seconds with a decimal point ("1317048145.963.png"), whole nanoseconds
+("1317048145963000000.png"), or seconds and nanoseconds ("1317048145_963000000.png", or two columns).
+Where all of them are dates in whole microseconds or milliseconds they are read as such.
 """
 
 from __future__ import annotations
@@ -13,6 +17,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -30,8 +35,15 @@ LEAST_STEP_NS = 1_000_000
 _WHOLE = re.compile(r"[+-]?\d{1,20}", re.ASCII)
 _NUMBER = re.compile(r"[+-]?\d", re.ASCII)
 _SECONDS = re.compile(r"\d{1,12}\.\d+", re.ASCII)
+_PAIR = re.compile(r"(\d{1,10})_(\d{1,9})", re.ASCII)
+_DATE = re.compile(r"\d{9,10}\.\d+|\d{13,19}", re.ASCII)
+"""What cannot be a count beside a stamp: a date in seconds, or in whole units of 1 ms to 1 ns."""
+_SECONDS_OF_DATE = re.compile(r"\d{9,10}", re.ASCII)
+_DATES_NS = (10**18, 42 * 10**17)
+"""The years 2001 to 2103, between which dates of other units than nanoseconds have to lie [ns]."""
+_OTHER_UNITS_NS = (1_000, 1_000_000)
 _STAMP = "seconds with a decimal point, or whole nanoseconds"
-_LINE = f"name,stamp or stamp,name; the stamp in {_STAMP}"
+_LINE = f"name,stamp or stamp,name (or name,sec,nsec); the stamp in {_STAMP}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +84,8 @@ def stamped_files(folder: Path, suffixes: tuple[str, ...]) -> StampedFiles:
     if table.exists():
         stamps, without_file = _table(table, files)
     else:
-        stamps = {name: _stamp_of(path, table) for name, path in files.items()}
+        words = {name: _stamp_of(path, table) for name, path in files.items()}
+        stamps = _in_ns(words, {name: str(path) for name, path in files.items()})
     names = sorted(stamps, key=lambda name: stamps[name])
     stamps_ns = np.array([stamps[name] for name in names], np.int64)
     check_rising(stamps_ns, table if table.exists() else folder)
@@ -85,20 +98,51 @@ def stamped_files(folder: Path, suffixes: tuple[str, ...]) -> StampedFiles:
     return StampedFiles(stamps_ns, paths, len(files) - len(names), without_file)
 
 
-def _stamp_of(path: Path, table: Path) -> int:
-    """Stamp [ns] that a file's name is."""
+def _stamp_of(path: Path, table: Path) -> str:
+    """Stamp that a file's name is."""
     stem = path.name[: -len(path.suffix)]
-    if (stamp := _stamp(stem, path)) is not None:
-        return stamp
+    if _is_stamp(stem):
+        return stem
     expected = f"a stamp ({_STAMP}), or {table.name} beside it"
     raise DataError(path, f"the name {stem!r:.80}", expected)
 
 
-def _stamp(word: str, place: str | Path) -> int | None:
-    """A stamp [ns], or None where the word is none."""
-    if _SECONDS.fullmatch(word):
-        return parse_seconds(word, place)
-    return checked_ns(int(word), place) if _WHOLE.fullmatch(word) else None
+def _is_stamp(word: str) -> bool:
+    return any(kind.fullmatch(word) for kind in (_SECONDS, _WHOLE, _PAIR))
+
+
+def _in_ns(words: Mapping[str, str], places: Mapping[str, str]) -> dict[str, int]:
+    """Stamps [ns] by the names of their files, of words that are such.
+
+    Which unit whole numbers have all of them show together.
+    """
+    pairs = [pair for word in words.values() if (pair := _PAIR.fullmatch(word))]
+    padded = all(len(pair[2]) == 9 for pair in pairs)
+    part_ns = 1 if padded or any(int(pair[2]) >= 10**6 for pair in pairs) else 1_000
+    whole = [int(word) for word in words.values() if _WHOLE.fullmatch(word)]
+    unit_ns = _unit_ns(whole) if len(whole) == len(words) else 1
+
+    def stamp(word: str, place: str) -> int:
+        if pair := _PAIR.fullmatch(word):
+            return checked_ns(int(pair[1]) * 10**9 + int(pair[2]) * part_ns, place)
+        if _SECONDS.fullmatch(word):
+            return parse_seconds(word, place)
+        return checked_ns(int(word) * unit_ns, place)
+
+    return {name: stamp(word, places[name]) for name, word in words.items()}
+
+
+def _unit_ns(whole: list[int]) -> int:
+    """Unit of whole numbers: nanoseconds, or that by which they are dates at a sensor's rate."""
+    steps = np.diff(np.unique(np.array(whole, np.float64)))
+    step = float(np.median(steps)) if len(steps) else 0.0
+    if step >= LEAST_STEP_NS:
+        return 1
+    for unit_ns in _OTHER_UNITS_NS:
+        dates = _DATES_NS[0] <= min(whole) * unit_ns <= max(whole) * unit_ns <= _DATES_NS[1]
+        if dates and (len(whole) == 1 or step * unit_ns >= LEAST_STEP_NS):
+            return unit_ns
+    return 1
 
 
 def _table(table: Path, files: Mapping[str, Path]) -> tuple[dict[str, int], int]:
@@ -106,15 +150,16 @@ def _table(table: Path, files: Mapping[str, Path]) -> tuple[dict[str, int], int]
     text = read_text(table, STAMPS_CSV)
     if text.count("\n") > MAX_STAMPS:
         raise DataError(table, count_of(text.count(chr(10)), "line"), f"at most {MAX_STAMPS} stamps")
-    stamps: dict[str, int] = {}
+    stamps: dict[str, str] = {}
+    places: dict[str, str] = {}
     missing: list[tuple[str, str]] = []
     known = _by_any_name(files)
     for number, line in enumerate(text.splitlines(), 1):
         words = _words(line)
         place = f"{table}:{number}"
-        if not any(words) or (number == 1 and _is_heading(words, known)):
+        if not any(words) or ((number == 1 or line.startswith("#")) and _is_heading(words, known)):
             continue
-        entry = _entry(words, known, place)
+        entry = _entry(words, known) if len(words) == 2 else _entry_of_many(words, known)
         if entry is None:
             raise DataError(place, f"{line!r:.80}", _LINE)
         word, stamp = entry
@@ -124,13 +169,13 @@ def _table(table: Path, files: Mapping[str, Path]) -> tuple[dict[str, int], int]
         elif name in stamps:
             raise DataError(place, f"{name!r:.80} again", "each file once")
         else:
-            stamps[name] = stamp
+            stamps[name], places[name] = stamp, place
     if missing and not stamps:
         place, word = missing[0]
         raise DataError(place, f"{word!r:.80}", f"the name of a file in {table.stem}")
     if not stamps:
         raise DataError(table, "no stamp", "one name,stamp a line")
-    return stamps, len(missing)
+    return _in_ns(stamps, places), len(missing)
 
 
 def _by_any_name(files: Mapping[str, Path]) -> dict[str, str]:
@@ -144,25 +189,49 @@ def _last_part(word: str) -> str:
     return re.split(r"[/\\]", word)[-1]
 
 
-def _entry(words: list[str], known: Mapping[str, str], place: str) -> tuple[str, int] | None:
-    """Name and stamp [ns] of a line, or None where it has another content."""
-    if len(words) != 2:
-        return None
+def _entry(words: list[str], known: Mapping[str, str]) -> tuple[str, str] | None:
+    """Name and stamp of a line, or None where it has another content."""
     # A file may be called by a number, too: 000000 or its stamp.
     for name, word in sorted((words, words[::-1]), key=lambda pair: _last_part(pair[0]) not in known):
-        if (stamp := _stamp(word, place)) is not None:
-            return name, stamp
+        if _is_stamp(word):
+            return name, word
     return None
+
+
+def _entry_of_many(words: list[str], known: Mapping[str, str]) -> tuple[str, str] | None:
+    """Name and stamp of a line of three columns or more, or None where it does not show which they are.
+
+    The name is that of a file, or no number. The stamp is the only date, or seconds and nanoseconds side by
+    side.
+    """
+    named = [word for word in words if _last_part(word) in known]
+    named = [word for word in named if not _WHOLE.fullmatch(word)] or named
+    named = named or [word for word in words if not _NUMBER.match(word)]
+    if len(words) < 3 or len(named) != 1:
+        return None
+    others = [word for word in words if word != named[0]]
+    dates = {word for word in others if _DATE.fullmatch(word)}
+    pairs = [
+        f"{seconds}_{part}"
+        for seconds, part in pairwise(others)
+        if _PAIR.fullmatch(f"{seconds}_{part}") and (len(others) == 2 or _SECONDS_OF_DATE.fullmatch(seconds))
+    ]
+    if len(dates) == 1:
+        return named[0], dates.pop()
+    return (named[0], pairs[0]) if len(pairs) == 1 and not dates else None
 
 
 def _is_heading(words: list[str], known: Mapping[str, str]) -> bool:
     """Whether a line names neither a file nor a number: "name,stamp_ns", "#timestamp [ns],filename"."""
-    return len(words) == 2 and not any(word in known or _NUMBER.match(word) for word in words)
+    return len(words) > 1 and not any(_last_part(word) in known or _NUMBER.match(word) for word in words)
 
 
 def _words(line: str) -> list[str]:
     """The fields of a line, quotes removed; a name in quotes may hold commas, and quotes doubled."""
+    line = line.strip()
+    between = next((mark for mark in ",;\t" if mark in line), " ")
     try:
-        return [word.strip() for word in next(csv.reader([line], skipinitialspace=True, strict=True), [])]
+        rows = csv.reader([line], delimiter=between, skipinitialspace=True, strict=True)
+        return [word.strip() for word in next(rows, [])]
     except csv.Error:
         return [line]

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.data.frame_parts import image_at, image_positions, scan_at, scan_positions
+from sst_graph.data.source_view import SourceView
 from sst_graph.timestamps import Span
 from sst_graph.types import Source
 
@@ -36,12 +37,16 @@ class SourceFacts:
         scan, image: the LiDAR and the camera.
         nominal: where the nominal extrinsic comes from, or why there is none.
         notes: sentences on what else was found.
+        remarks: such that concern every result of the drive.
+        doubts: what may be wrong with the data: first reasons of a result that is not ok.
     """
 
     scan: SensorFacts
     image: SensorFacts
     nominal: str = ""
     notes: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
 
 
 def facts_of(source: Source) -> SourceFacts | None:
@@ -49,6 +54,8 @@ def facts_of(source: Source) -> SourceFacts | None:
     frame is read. Of other sources a few frames are looked at.
     """
     reader = getattr(source, "facts", None)
+    if not callable(reader) and isinstance(source, SourceView):
+        return facts_of(source.source)
     return reader() if callable(reader) else None
 
 

@@ -166,7 +166,7 @@ def drive_info(source: Source) -> DriveInfo:
         images=of_images,
         nominal=content.nominal,
         nominal_reason=facts.nominal,
-        notes=facts.notes,
+        notes=(*facts.notes, *facts.remarks, *facts.doubts),
         missing=missing_for(content),
     )
 

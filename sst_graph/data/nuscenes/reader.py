@@ -1,4 +1,4 @@
-"""Scenes of nuScenes: LIDAR_TOP and one camera, key frames and sweeps, by the tables alone.
+"""Scenes of nuScenes: one LiDAR and one camera, key frames and sweeps, by the tables alone.
 
 Each sensor has its own stamps [us]. The nominal extrinsic is that of the rig: both sensors' poses in the ego
 vehicle, without its motion between the stamps. nuScenes has no masks of images; lidarseg labels stand at the
@@ -127,8 +127,7 @@ def open_nuscenes(path: Path, options: SourceOptions) -> Source:
         raise ConfigError(f"{path}: tables {named}: keep one of them in the folder")
     tables = versions[0]
     scene = _scene(tables, options.sequence)
-    named = _CAMERA if options.camera == SourceOptions().camera else options.camera
-    stored = _channels(tables, scene, named)
+    stored = _channels(tables, scene, _named(tables, options))
     lidar, camera = (_present(path, tables, channel) for channel in stored)
     model, nominal = _rig(tables, lidar, camera)
     size = (model.width, model.height)
@@ -177,18 +176,38 @@ def _scene(tables: Path, name: str | None) -> Record:
     return found[0]
 
 
-def _channels(tables: Path, scene: Record, camera: str) -> tuple[Channel, Channel]:
-    """LiDAR and camera of a scene.
+def _named(tables: Path, options: SourceOptions) -> tuple[str, str]:
+    """Names of the LiDAR and of the camera: given, nuScenes' own, or those of the only ones.
+
+    Raises:
+        ConfigError: none of this name, or several and none named.
+    """
+    path, default = tables / "sensor.json", SourceOptions()
+    found = []
+    for modality, given, unnamed, usual in (
+        ("lidar", options.cloud, default.cloud, _LIDAR),
+        ("camera", options.camera, default.camera, _CAMERA),
+    ):
+        names = sorted({text_of(r, "channel", path) for r in records(path) if r.get("modality") == modality})
+        name = given
+        if given == unnamed:
+            name = names[0] if len(names) == 1 else usual
+        if name not in names:
+            what = f"{modality} {name!r}" if given != unnamed else f"no {modality} is named"
+            option = "--cloud" if modality == "lidar" else "--camera"
+            raise ConfigError(f"{what}: {tables} has {', '.join(names) or 'none'} ({option})")
+        found.append(name)
+    return found[0], found[1]
+
+
+def _channels(tables: Path, scene: Record, names: tuple[str, str]) -> tuple[Channel, Channel]:
+    """LiDAR and camera of a scene, of some names.
 
     Raises:
         DataError: no data of one.
-        ConfigError: no such camera.
     """
     sensors, calibrated = tables / "sensor.json", tables / "calibrated_sensor.json"
     channels = {text_of(r, "token", sensors): text_of(r, "channel", sensors) for r in records(sensors)}
-    if camera not in channels.values() or not camera.startswith("CAM"):
-        named = ", ".join(sorted(name for name in set(channels.values()) if name.startswith("CAM")))
-        raise ConfigError(f"camera {camera!r}: {tables} has {named}")
     calibrations = {text_of(r, "token", calibrated): r for r in records(calibrated)}
     samples_path, data_path = tables / "sample.json", tables / "sample_data.json"
     scene_token = text_of(scene, "token", tables / "scene.json")
@@ -197,8 +216,8 @@ def _channels(tables: Path, scene: Record, camera: str) -> tuple[Channel, Channe
         for r in records(samples_path)
         if r.get("scene_token") == scene_token
     }
-    data: dict[str, list[Record]] = {_LIDAR: [], camera: []}
-    rigs: dict[str, set[str]] = {_LIDAR: set(), camera: set()}
+    data: dict[str, list[Record]] = {name: [] for name in names}
+    rigs: dict[str, set[str]] = {name: set() for name in names}
     for record in records(data_path):
         if text_of(record, "sample_token", data_path) not in samples:
             continue
@@ -210,7 +229,7 @@ def _channels(tables: Path, scene: Record, camera: str) -> tuple[Channel, Channe
             data[channel].append(record)
             rigs[channel].add(token)
     found = []
-    for name in (_LIDAR, camera):
+    for name in names:
         if len(rigs[name]) != 1:
             raise DataError(
                 data_path, f"{count_of(len(rigs[name]), 'calibration')} of {name} in the scene", "one"

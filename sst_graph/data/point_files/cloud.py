@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.data.arrays import MAX_POINTS, check_metres
-from sst_graph.data.point_times import FARTHEST_S, WITHOUT_TIMES, seconds_after_stamp
+from sst_graph.data.point_times import FARTHEST_S, WITHOUT_TIMES, PointClock, seconds_after_stamp
 from sst_graph.errors import DataError, count_of
 from sst_graph.files.reading import FileKind
 
@@ -75,20 +75,27 @@ class PointFields:
         values = self._first(LABELS)
         return None if values is None else self._whole(values, 0xFFFFFFFF, "labels").astype(np.uint32)
 
-    def offsets_s(self, stamp_ns: int, used: NDArray[np.bool_]) -> NDArray[np.float32] | None:
+    def times(self) -> NDArray[Any] | None:
+        """Times (n,) of the points as they are stored, in whichever unit, or None."""
+        return self._first(TIMES)
+
+    def offsets_s(
+        self, stamp_ns: int, used: NDArray[np.bool_], clock: PointClock | None = None
+    ) -> NDArray[np.float32] | None:
         """Times (n,) of the points after the scan's stamp [s], or None where the cloud has none.
 
         How they are counted: :func:`~sst_graph.data.point_times.seconds_after_stamp`.
 
         Args:
             used: (n,) False for points that are left out, whose times may be anything.
+            clock: by which the times count; None: that of the stamp.
 
         Raises:
             DataError: a time more than a second from the stamp.
         """
-        values = self._first(TIMES)
+        values = self.times()
         kept = np.flatnonzero(used)
-        seconds = None if values is None else seconds_after_stamp(values[kept], stamp_ns)
+        seconds = None if values is None else seconds_after_stamp(values[kept], stamp_ns, clock)
         if seconds is None:
             return None
         bad = kept[~(np.abs(seconds) <= FARTHEST_S)]

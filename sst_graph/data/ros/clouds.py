@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sst_graph.data.arrays import MAX_POINTS
 from sst_graph.data.point_files.cloud import INTENSITIES, RINGS, TIMES
-from sst_graph.data.point_times import FARTHEST_S, WITHOUT_TIMES, seconds_after_stamp
+from sst_graph.data.point_times import FARTHEST_S, WITHOUT_TIMES, PointClock, seconds_after_stamp
 from sst_graph.errors import DataError, count_of
 from sst_graph.validation import FARTHEST_M
 
@@ -40,7 +40,12 @@ class MessagePoints:
 
 
 def cloud_of(
-    message: Any, stamp_ns: int, place: str, times: bool = True, labels: bool = False
+    message: Any,
+    stamp_ns: int,
+    place: str,
+    times: bool = True,
+    labels: bool = False,
+    clock: PointClock | None = None,
 ) -> MessagePoints:
     """The cloud of a message.
 
@@ -49,14 +54,37 @@ def cloud_of(
         stamp_ns: the header's stamp.
         times: read the times of the points, where the message has them.
         labels: read the fields ``label`` and ``instance``, where the message has them.
+        clock: by which the times count; None: that of the stamp.
 
     Raises:
         DataError: no x, y, z; fewer bytes than points; times that are no times of this scan.
     """
     # What has no value as a float of 32 bits becomes inf, and is left out.
     with np.errstate(over="ignore", invalid="ignore"):
-        table = message if isinstance(message, np.ndarray) else _table(message, place)
-        return _cloud(table, stamp_ns, place, times, labels)
+        table, points, left_out = _used(message, place)
+        if len(points) and float(np.abs(points).max()) > FARTHEST_M:
+            found = f"a coordinate of {float(np.abs(points).max()):.3g} m"
+            raise DataError(place, found, f"at most {FARTHEST_M:g} m")
+        return MessagePoints(
+            points,
+            _rings(table),
+            _offsets(table, stamp_ns, place, clock) if times else None,
+            _labels(table) if labels else None,
+            left_out,
+            _intensities(table),
+        )
+
+
+def times_of(message: Any, place: str) -> NDArray[Any] | None:
+    """Times (n,) of the points as they are stored, in whichever unit; None where the message has none.
+
+    Raises:
+        DataError: as :func:`cloud_of`.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        table, _, _ = _used(message, place)
+    name = _field_of_times(table)
+    return None if name is None else np.asarray(table[name])
 
 
 def field_names(message: Any) -> tuple[str, ...]:
@@ -66,22 +94,13 @@ def field_names(message: Any) -> tuple[str, ...]:
     return tuple(str(field.name) for field in message.fields)
 
 
-def _cloud(table: NDArray[Any], stamp_ns: int, place: str, times: bool, labels: bool) -> MessagePoints:
+def _used(message: Any, place: str) -> tuple[NDArray[Any], NDArray[np.float32], int]:
+    """Rows and coordinates (n, 3) of the points that are used, and how many are left out."""
+    table = message if isinstance(message, np.ndarray) else _table(message, place)
     points = np.stack([np.asarray(table[axis], np.float64) for axis in "xyz"], axis=1).astype(np.float32)
     # Drivers give NaN or the origin for beams without a return.
     used = np.isfinite(points).all(axis=1) & (points != 0.0).any(axis=1)
-    table, points = table[used], np.ascontiguousarray(points[used])
-    if len(points) and float(np.abs(points).max()) > FARTHEST_M:
-        found = f"a coordinate of {float(np.abs(points).max()):.3g} m"
-        raise DataError(place, found, f"at most {FARTHEST_M:g} m")
-    return MessagePoints(
-        points,
-        _rings(table),
-        _offsets(table, stamp_ns, place) if times else None,
-        _labels(table) if labels else None,
-        int(len(used) - used.sum()),
-        _intensities(table),
-    )
+    return table[used], np.ascontiguousarray(points[used]), int(len(used) - used.sum())
 
 
 def _table(message: Any, place: str) -> NDArray[Any]:
@@ -142,10 +161,16 @@ def _intensities(table: NDArray[Any]) -> NDArray[np.float32] | None:
     return None if name is None else np.asarray(table[name]).astype(np.float32)
 
 
-def _offsets(table: NDArray[Any], stamp_ns: int, place: str) -> NDArray[np.float32] | None:
+def _field_of_times(table: NDArray[Any]) -> str | None:
+    return next((name for name in TIMES if name in _names(table)), None)
+
+
+def _offsets(
+    table: NDArray[Any], stamp_ns: int, place: str, clock: PointClock | None
+) -> NDArray[np.float32] | None:
     """Times after the stamp [s]."""
-    name = next((name for name in TIMES if name in _names(table)), None)
-    seconds = None if name is None else seconds_after_stamp(table[name], stamp_ns)
+    name = _field_of_times(table)
+    seconds = None if name is None else seconds_after_stamp(table[name], stamp_ns, clock)
     if seconds is None:
         return None
     worst = float(np.abs(seconds).max())

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.classes import MaskEncoding, classes_of_mask, classes_of_points
+from sst_graph.data.point_times import PointClock
 from sst_graph.data.ros.clouds import cloud_of
 from sst_graph.data.ros.images import mask_of
 from sst_graph.data.scan_order import rings_from_order
@@ -25,11 +26,13 @@ class CloudReading:
         timing: times of the points by azimuth, where a sense of rotation is given.
         stored_times: take the times that the clouds hold.
         labels: take the labels that the clouds hold.
+        clock: of the stored times; None: that of the stamps.
     """
 
     timing: SweepTiming | None = None
     stored_times: bool = True
     labels: bool = False
+    clock: PointClock | None = None
 
 
 def scan_of(message: Any, stamp_ns: int, place: str, reading: CloudReading) -> Scan:
@@ -38,7 +41,7 @@ def scan_of(message: Any, stamp_ns: int, place: str, reading: CloudReading) -> S
     Raises:
         DataError: as :func:`~sst_graph.data.ros.clouds.cloud_of`, or a label that SemanticKITTI has not.
     """
-    cloud = cloud_of(message, stamp_ns, place, reading.stored_times, reading.labels)
+    cloud = cloud_of(message, stamp_ns, place, reading.stored_times, reading.labels, reading.clock)
     count = len(cloud.points)
     classes, instances = np.full(count, SemanticClass.IGNORE, np.uint8), np.zeros(count, np.uint16)
     if cloud.labels is not None:

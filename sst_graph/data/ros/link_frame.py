@@ -41,6 +41,11 @@ def of_optical_axes(linkTl: gtsam.Pose3) -> gtsam.Pose3:
     return gtsam.Pose3(FORWARD_R_OPTICAL.inverse(), np.zeros(3)) * linkTl
 
 
+def of_link_axes(oTl: gtsam.Pose3) -> gtsam.Pose3:
+    """The inverse of :func:`of_optical_axes`."""
+    return gtsam.Pose3(FORWARD_R_OPTICAL, np.zeros(3)) * oTl
+
+
 def _seen(cTl: gtsam.Pose3, points: NDArray[np.float32], model: CameraModel) -> int:
     """Number of points in the image."""
     uvs, valid = model.project(cTl.transformFrom(points.T.astype(np.float64)).T)

@@ -16,21 +16,22 @@ from numpy.typing import NDArray
 from sst_graph.cameras import Rectification
 from sst_graph.classes import MaskEncoding, guess_mask_encoding
 from sst_graph.data.arrays import listed
+from sst_graph.data.point_times import PointClock, ScanTimes, clock_of_points
 from sst_graph.data.rectified import RectifiedSource
 from sst_graph.data.ros.bag import Bag, Topic
 from sst_graph.data.ros.camera_info import ImageGeometry, geometry_by_file, has_matrix, image_geometry
-from sst_graph.data.ros.clouds import cloud_of, field_names
+from sst_graph.data.ros.clouds import cloud_of, field_names, times_of
 from sst_graph.data.ros.frames import CloudReading, check_size, mask_classes, scan_of
 from sst_graph.data.ros.images import mask_of, picture_of
 from sst_graph.data.ros.index import BagIndex, Stamped, read_index
 from sst_graph.data.ros.link_frame import LINK_AXES, is_link, of_optical_axes
+from sst_graph.data.ros.moving_frame import check_moves_along
 from sst_graph.data.ros.topics import Topics, choose_topics
 from sst_graph.data.source import Loader, SourceOptions
 from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
 from sst_graph.errors import ConfigError, DataError, count_of, printable
 from sst_graph.files.reading import path_of
 from sst_graph.sampling import evenly_spread
-from sst_graph.sweep_timing import SweepTiming
 from sst_graph.types import CameraImage, Scan, SemanticClass, Source
 
 _LOG = logging.getLogger(__name__)
@@ -52,8 +53,7 @@ class BagMessages:
         index: of the messages.
         size: width and height of the images [px].
         encoding: of the masks; None without masks.
-        timing: times of the points by azimuth, where the options name a sense of rotation.
-        stored_times: take the times that the clouds hold.
+        reading: of the clouds.
     """
 
     bag: Bag
@@ -61,8 +61,7 @@ class BagMessages:
     index: BagIndex
     size: tuple[int, int]
     encoding: MaskEncoding | None
-    timing: SweepTiming | None
-    stored_times: bool
+    reading: CloudReading
 
     def scan(self, k: int) -> Scan:
         """Scan k of the topic.
@@ -71,9 +70,8 @@ class BagMessages:
             DataError: the message holds what it must not, or the bag is damaged.
         """
         stamped = self.index.clouds[k]
-        place, labels = _place(self.bag, stamped), self.topics.mask is not None
         message = self._message(stamped, self.topics.cloud.type)
-        return scan_of(message, stamped.stamp_ns, place, CloudReading(self.timing, self.stored_times, labels))
+        return scan_of(message, stamped.stamp_ns, _place(self.bag, stamped), self.reading)
 
     def image(self, k: int) -> CameraImage:
         """Image k of the topic, with the mask of its stamp; errors as of a scan."""
@@ -155,14 +153,20 @@ def open_ros(path: Path, options: SourceOptions) -> Source:
     topics = choose_topics(path, bag.topics, options)
     index = read_index(bag, topics, options.stamps)
     _check_masks(bag, index)
+    of_frame = check_moves_along(
+        index.cloud_frame, index.image_frame, index.transforms, f"{path}, {topics.cloud.name}"
+    )
     size = _size(bag, topics, index)
     geometry = _geometry(path, topics, index, size, options)
     oTl, reason = _extrinsic(bag, topics, index, geometry)
     nominal = None if oTl is None else geometry.extrinsic(oTl)
     if nominal is None:
         _LOG.info("%s: no nominal extrinsic: %s", printable(path), reason)
-    encoding, timing = _encoding(bag, topics, index, options), options.timing(_stamps(index.clouds))
-    messages = BagMessages(bag, topics, index, size, encoding, timing, options.sweep == "auto")
+    clock, of_clock = _clock(bag, topics, index, options)
+    timing, has_labels = options.timing(_stamps(index.clouds)), topics.mask is not None
+    reading = CloudReading(timing, options.sweep == "auto", has_labels, clock)
+    encoding = _encoding(bag, topics, index, options)
+    messages = BagMessages(bag, topics, index, size, encoding, reading)
     notes = [f"camera model from {topics.info.name if topics.info else options.camera_file}"]
     notes.append(f"fields of the clouds: {', '.join(_fields(bag, topics, index))}")
     if index.repeated:
@@ -172,7 +176,15 @@ def open_ros(path: Path, options: SourceOptions) -> Source:
         notes.append(f"{others} of {topics.info.name} of another camera than the first, whose model is taken")
         _LOG.warning("%s: %s", printable(path), notes[-1])
     model, name = geometry.model, printable(path.stem if path.is_file() else path.name)
-    properties = DriveProperties(name, model.intrinsics, nominal, nominal_reason=reason, notes=tuple(notes))
+    properties = DriveProperties(
+        name,
+        model.intrinsics,
+        nominal,
+        nominal_reason=reason,
+        notes=tuple(notes),
+        remarks=(of_clock,) * bool(of_clock),
+        doubts=(of_frame,) * bool(of_frame),
+    )
     scans = Sensor(_stamps(index.clouds), messages.scan, _place_of(topics.cloud), topics.cloud.name)
     images = Sensor(_stamps(index.images), messages.image, _place_of(topics.image), topics.image.name)
     drive = merged(properties, scans, images, options, path, scans_are_complete=True)
@@ -243,6 +255,25 @@ def _size(bag: Bag, topics: Topics, index: BagIndex) -> tuple[int, int]:
 def _fields(bag: Bag, topics: Topics, index: BagIndex) -> tuple[str, ...]:
     """Names of what the first cloud holds for each point."""
     return field_names(_read(bag, topics, index, index.clouds[0], topics.cloud.type))
+
+
+def _clock(
+    bag: Bag, topics: Topics, index: BagIndex, options: SourceOptions
+) -> tuple[PointClock | None, str]:
+    """The clock of the points' times, where it is not that of the stamps, and a sentence on it."""
+    if options.sweep != "auto":
+        return None, ""
+
+    def read(k: int) -> ScanTimes | None:
+        first = index.clouds[k]
+        try:
+            message = _read(bag, topics, index, first, topics.cloud.type)
+            values = times_of(message, _place(bag, first))
+        except DataError:  # which the scan will raise when it is read
+            return None
+        return None if values is None else ScanTimes(first.stamp_ns, values, first.message.received_ns)
+
+    return clock_of_points(read, len(index.clouds), options.sweep_stamp)
 
 
 def _encoding(bag: Bag, topics: Topics, index: BagIndex, options: SourceOptions) -> MaskEncoding | None:

@@ -16,6 +16,8 @@ _LISTED = 12
 """Frames that a message lists at most."""
 _SAME = 1e-6
 """Transforms that differ by less [m, and in the elements of the rotation] are the same."""
+_STEADY_M, _STEADY_RAD = 1e-3, 1e-4
+"""Transforms that differ by less are constant ones that software published with rounding."""
 
 
 class Transforms:
@@ -24,6 +26,7 @@ class Transforms:
     def __init__(self) -> None:
         self._poses: dict[tuple[str, str], gtsam.Pose3] = {}
         self._moving: set[tuple[str, str]] = set()
+        self._rounded: set[tuple[str, str]] = set()
         self._wrong: dict[tuple[str, str], str] = {}
 
     def add(self, message: Any) -> None:
@@ -38,8 +41,11 @@ class Transforms:
         """Take the pose of ``child`` in ``parent``."""
         edge = _frame(parent), _frame(child)
         known = self._poses.setdefault(edge, pose)
-        if not known.equals(pose, _SAME):
-            self._moving.add(edge)
+        if known.equals(pose, _SAME):
+            return
+        step = gtsam.Pose3.Logmap(known.between(pose))
+        steady = np.linalg.norm(step[:3]) <= _STEADY_RAD and np.linalg.norm(step[3:]) <= _STEADY_M
+        (self._rounded if steady else self._moving).add(edge)
 
     def joined(self, other: Transforms) -> Transforms:
         """The transforms of this file and of another one."""
@@ -48,6 +54,7 @@ class Transforms:
             for (parent, child), pose in one._poses.items():
                 both.add_pose(parent, child, pose)
             both._moving |= one._moving
+            both._rounded |= one._rounded
             both._wrong |= one._wrong
         return both
 
@@ -85,6 +92,14 @@ class Transforms:
             seen.add(frame)
         return frame
 
+    def moves(self, one: str, other: str) -> bool:
+        """Whether a frame moves against another, by the chain that joins them; where none does, whether it
+        moves against any frame that it has a transform with."""
+        path = self._path(one, other) if one != other else None
+        if path is None:
+            return any(one in edge for edge in self._moving)
+        return any(edge in self._moving or edge[::-1] in self._moving for edge in pairwise(path))
+
     def pose(self, parent: str, child: str) -> tuple[gtsam.Pose3 | None, str]:
         """Pose of ``child`` in ``parent``, or None, and why: missing, moving, ambiguous or none."""
         if parent == child:
@@ -92,7 +107,7 @@ class Transforms:
         path = self._path(parent, child)
         if path is None:
             return None, f"no chain of transforms from {parent!r} to {child!r}{self._unknown(parent, child)}"
-        pose = gtsam.Pose3()
+        pose, rounded = gtsam.Pose3(), ""
         for first, second in pairwise(path):
             edge = (first, second) if (first, second) in self._poses else (second, first)
             if wrong := self._wrong.get(edge):
@@ -102,15 +117,18 @@ class Transforms:
             parents = self.parents(edge[1])
             if len(parents) > 1:
                 return None, f"{edge[1]!r} has several parents: {', '.join(parents)}"
+            if edge in self._rounded:
+                rounded += f"; {edge[0]} - {edge[1]} varies, by less than 1 mm and 1e-4 rad"
             step = self._poses[edge]
             pose = pose * (step if edge == (first, second) else step.inverse())
-        return pose, f"by transforms {' - '.join(path)}"
+        return pose, f"by transforms {' - '.join(path)}{rounded}"
 
     def _without(self, children: Collection[str]) -> Transforms:
         """All transforms but the poses of some frames."""
         kept = Transforms()
         kept._poses = {edge: pose for edge, pose in self._poses.items() if edge[1] not in children}
         kept._moving = {edge for edge in self._moving if edge in kept._poses}
+        kept._rounded = {edge for edge in self._rounded if edge in kept._poses}
         kept._wrong = {edge: wrong for edge, wrong in self._wrong.items() if edge in kept._poses}
         return kept
 

@@ -471,3 +471,22 @@ def test_chains_that_are_missing_moving_or_ambiguous_give_no_pose() -> None:
         pose, reason = found.pose(CAMERA_FRAME, LIDAR_FRAME)
         assert pose is None and words in reason
     assert transforms(whole, whole).pose(CAMERA_FRAME, LIDAR_FRAME)[0] is not None
+
+
+@pytest.mark.parametrize(
+    ("turn_rad", "metres", "is_constant"),
+    [(5e-5, 0.0, True), (0.0, 8e-4, True), (2e-4, 0.0, False), (0.0, 2e-3, False)],
+)
+def test_a_transform_that_is_published_with_rounding_is_constant(
+    turn_rad: float, metres: float, is_constant: bool
+) -> None:
+    mast = chain(CTL)["base_link", "mast"]
+    moved = mast * gtsam.Pose3(gtsam.Rot3.Rz(turn_rad), np.array([metres, 0.0, 0.0]))
+    found = transforms(MAKE.transforms(chain(CTL)), MAKE.transforms({("base_link", "mast"): moved}))
+    for either in (found, transforms().joined(found), found.beside(transforms())):
+        pose, reason = either.pose(CAMERA_FRAME, LIDAR_FRAME)
+        if is_constant:
+            assert pose is not None and pose.equals(CTL, 1e-9)
+            assert reason.endswith("; base_link - mast varies, by less than 1 mm and 1e-4 rad")
+        else:
+            assert pose is None and reason.endswith("from 'base_link' to 'mast' is not constant")

@@ -1,7 +1,8 @@
-"""Times of points, in whichever way a driver counts them."""
+"""Times of points in seconds after their scan's stamp, in whichever way a driver counts them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ def tells_nothing(values: NDArray[Any]) -> bool:
     return not values.any() or (len(values) > 1 and bool((values == values[0]).all()))
 
 
-def seconds_after_stamp(values: NDArray[Any], stamp_ns: int) -> NDArray[np.float64] | None:
+def likely_seconds(values: NDArray[Any], stamp_ns: int) -> NDArray[np.float64] | None:
     """Times (n,) of points after their scan's stamp [s]; None where they tell nothing.
 
     Drivers count seconds in floats and nanoseconds in whole numbers, and some milliseconds or microseconds,
@@ -40,22 +41,37 @@ def seconds_after_stamp(values: NDArray[Any], stamp_ns: int) -> NDArray[np.float
     """
     if tells_nothing(values):
         return None
-    whole = values.dtype.kind in "iu"
-    numbers = values.astype(np.int64 if whole else np.float64)
-    finite = numbers[np.isfinite(numbers)]
-    ends = np.array([finite.min(), finite.max()]) if len(finite) else numbers[:1]
-    units_ns = _OF_WHOLE_NS if whole else _OF_FLOATS_NS
-    for unit_ns in units_ns:
+    numbers, ends = counted(values)
+    for unit_ns in units_ns(values):
         for clock_ns in (0, stamp_ns):
-            first, last = _read(ends[0], unit_ns, clock_ns), _read(ends[-1], unit_ns, clock_ns)
-            if _SCAN_LASTS_S[0] <= last - first <= _SCAN_LASTS_S[1] and _farthest(first, last) <= FARTHEST_S:
-                return np.asarray(_read(numbers, unit_ns, clock_ns))
-    readings = [(units_ns[0], 0), (units_ns[0], stamp_ns), (1, stamp_ns)]
-    nearest = min(readings, key=lambda r: max(_farthest(*(_read(end, *r) for end in ends)), FARTHEST_S))
-    return np.asarray(_read(numbers, *nearest))
+            first, last = read_as(ends[0], unit_ns, clock_ns), read_as(ends[-1], unit_ns, clock_ns)
+            if lasts_a_scan(last - first) and _farthest(first, last) <= FARTHEST_S:
+                return np.asarray(read_as(numbers, unit_ns, clock_ns))
+    usual_ns = units_ns(values)[0]
+    readings = [(usual_ns, 0), (usual_ns, stamp_ns), (1, stamp_ns)]
+    nearest = min(readings, key=lambda r: max(_farthest(*(read_as(end, *r) for end in ends)), FARTHEST_S))
+    return np.asarray(read_as(numbers, *nearest))
 
 
-def _read(numbers: Any, unit_ns: int, clock_ns: int) -> Any:
+def counted(values: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Times (n,) as whole numbers of 64 bits or floats of 64, and the first and the last of those that are
+    finite; a single NaN where none is."""
+    numbers = values.astype(np.int64 if values.dtype.kind in "iu" else np.float64)
+    finite = numbers[np.isfinite(numbers)]
+    return numbers, np.array([finite.min(), finite.max()]) if len(finite) else numbers[:1]
+
+
+def units_ns(values: NDArray[Any]) -> Sequence[int]:
+    """Units in which times of this type are counted [ns], the usual one first."""
+    return _OF_WHOLE_NS if values.dtype.kind in "iu" else _OF_FLOATS_NS
+
+
+def lasts_a_scan(seconds: float) -> bool:
+    """Whether a scan may take so long."""
+    return bool(_SCAN_LASTS_S[0] <= seconds <= _SCAN_LASTS_S[1])
+
+
+def read_as(numbers: Any, unit_ns: int, clock_ns: int) -> Any:
     """Seconds after an instant on the clock that counts in a unit; whole numbers are subtracted exactly."""
     count, rest_ns = divmod(clock_ns, unit_ns)
     return (numbers - numbers.dtype.type(count)) * (unit_ns * 1e-9) - rest_ns * 1e-9

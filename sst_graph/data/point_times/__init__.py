@@ -1,0 +1,21 @@
+"""Times of points, in whichever way and by whichever clock a driver counts them."""
+
+from __future__ import annotations
+
+from sst_graph.data.point_times.clock import (
+    PointClock,
+    ScanTimes,
+    clock_of_points,
+    seconds_after_stamp,
+)
+from sst_graph.data.point_times.seconds import FARTHEST_S, WITHOUT_TIMES, tells_nothing
+
+__all__ = [
+    "FARTHEST_S",
+    "WITHOUT_TIMES",
+    "PointClock",
+    "ScanTimes",
+    "clock_of_points",
+    "seconds_after_stamp",
+    "tells_nothing",
+]

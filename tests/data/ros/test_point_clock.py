@@ -1,0 +1,244 @@
+"""Times of points by the LiDAR's own clock, in bags and in folders."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.lib import recfunctions
+from numpy.typing import NDArray
+from stored import written
+
+pytest.importorskip("rosbags")
+
+from bags import CLOUD, EPOCH_NS, IMAGE, INFO, MASK, chain, table_of, writing
+
+from sst_graph.batch import calibrate
+from sst_graph.cli import main
+from sst_graph.data import KittiSource, open_source
+from sst_graph.data.arrays import read_labels
+from sst_graph.data.images import read_mask
+from sst_graph.data.info.facts import facts_of
+from sst_graph.data.point_times import PointClock, ScanTimes, clock_of_points, seconds_after_stamp
+from sst_graph.errors import DataError
+from sst_graph.simulator import SimulationConfig
+
+STREET = SimulationConfig(
+    seed=5, frames=20, width=414, height=125, azimuth_limit_deg=50.0, azimuth_step_deg=0.3,
+    vehicle_density=0.3, moving_fraction=0.0, time_offset_s=0.03, motion="no_stop", speed_mps=6.0,
+    rolling=True,
+)  # fmt: skip
+HALF_S = 0.0144
+"""Of the sweep within 50 deg of forward, where the stamps of the street are."""
+BOOT_NS = EPOCH_NS - 5_000_123_456_789
+"""When the LiDAR's clock began at 0."""
+DRIFT = 30e-6
+
+
+@dataclass(frozen=True)
+class Driver:
+    """How a driver stamps and counts.
+
+    Attributes:
+        own_clock: times of points are seconds of the LiDAR's own clock; else after the stamp.
+        later_s: of the stamp after the start of the sweep.
+        arrives_s: after the stamp.
+        jitter_s: standard deviation of what is added to stamps.
+        lost: every third scan lacks the first third of its returns.
+    """
+
+    own_clock: bool
+    later_s: float = 0.0
+    arrives_s: float = 0.11
+    jitter_s: float = 0.0
+    lost: bool = False
+
+
+@pytest.fixture(scope="module")
+def drive() -> KittiSource:
+    source = open_source(written(STREET))
+    assert isinstance(source, KittiSource)
+    return source
+
+
+def bag(drive: KittiSource, path: Path, driver: Driver) -> Path:
+    rng = np.random.default_rng(0)
+    with writing(path, "mcap") as out:
+        make = out.messages
+        out.add("/tf_static", make.transforms(chain(drive.nominal)), EPOCH_NS)
+        out.add(INFO, make.info(drive.camera), EPOCH_NS)
+        for k in range(len(drive)):
+            scan, image = drive.read_scan(k), drive.read_image(k)
+            assert scan is not None and scan.offsets_s is not None and image is not None
+            labels = read_labels(drive.files.labels[k], len(scan.points))
+            start_ns = EPOCH_NS + scan.stamp_ns - round(HALF_S * 1e9)
+            after_s = scan.offsets_s.astype(np.float64) + HALF_S
+            stamp_ns = start_ns + round((driver.later_s + driver.jitter_s * rng.standard_normal()) * 1e9)
+            times = after_s - (stamp_ns - start_ns) * 1e-9
+            if driver.own_clock:
+                times = (start_ns - BOOT_NS) * 1e-9 * (1.0 + DRIFT) + after_s
+            table = recfunctions.append_fields(
+                recfunctions.repack_fields(recfunctions.drop_fields(table_of(scan, labels), "time")),
+                "timestamp",
+                times,
+                usemask=False,
+            )
+            if driver.lost and k % 3 == 1:
+                table = table[after_s > 0.01]
+            out.add(CLOUD, make.cloud(stamp_ns, table), stamp_ns + round(driver.arrives_s * 1e9))
+            stamp_ns = EPOCH_NS + image.stamp_ns
+            out.add(IMAGE, make.image(stamp_ns, image.pixels), stamp_ns)
+            out.add(MASK, make.image(stamp_ns, read_mask(drive.files.masks[k]), "mono8"), stamp_ns)
+    return path
+
+
+def times_of(path: Path) -> list[NDArray[np.float64]]:
+    """Times of the points of each scan after EPOCH_NS [s]."""
+    scans = [frame.scan for frame in open_source(path, mask_topic=MASK) if frame.scan is not None]
+    return [(s.stamp_ns - EPOCH_NS) * 1e-9 + s.offsets_s for s in scans if s.offsets_s is not None]
+
+
+def remarks(path: Path, **options: Any) -> str:
+    facts = facts_of(open_source(path, mask_topic=MASK, **options))
+    assert facts is not None
+    return " ".join(facts.remarks)
+
+
+@pytest.mark.parametrize(
+    "driver",
+    [
+        Driver(True),
+        Driver(True, jitter_s=0.001),
+        Driver(True, lost=True),
+        Driver(True, later_s=2 * HALF_S, arrives_s=0.004),
+    ],
+    ids=["start", "jitter", "lost", "end"],
+)
+def test_times_of_another_clock_are_those_after_the_stamp(
+    drive: KittiSource, tmp_path: Path, driver: Driver
+) -> None:
+    true = times_of(bag(drive, tmp_path / "relative", Driver(False)))
+    found = times_of(bag(drive, tmp_path / "own", driver))
+    assert len(found) == len(true) == len(drive)
+    apart = [np.sort(one)[-50:] - np.sort(other)[-50:] for one, other in zip(found, true, strict=True)]
+    # One difference for all scans, whatever their own stamps and returns.
+    assert np.ptp(np.concatenate(apart)) < 1e-4 + driver.jitter_s
+    assert np.abs(np.concatenate(apart)).max() < 1e-4 + 2.0 * driver.jitter_s
+    named = "end" if driver.later_s else "start"
+    assert f"a stamp counts as the {named} of its sweep" in remarks(tmp_path / "own")
+    assert "of another clock than the stamps (1699994999." in remarks(tmp_path / "own")
+    assert "s behind them" in remarks(tmp_path / "own")
+    assert remarks(tmp_path / "relative") == remarks(tmp_path / "own", sweep="compensated") == ""
+
+
+def test_the_option_says_what_a_stamp_names(drive: KittiSource, tmp_path: Path) -> None:
+    path = bag(drive, tmp_path / "own", Driver(True))
+    by_start = open_source(path, mask_topic=MASK, sweep_stamp="start")[0].scan
+    by_end = open_source(path, mask_topic=MASK, sweep_stamp="end")[0].scan
+    assert by_start is not None and by_end is not None
+    assert by_start.offsets_s is not None and by_end.offsets_s is not None
+    np.testing.assert_allclose(by_start.offsets_s - by_end.offsets_s, 2 * HALF_S, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_the_calibration_is_that_of_times_after_the_stamp(drive: KittiSource, tmp_path: Path) -> None:
+    relative, own = (
+        open_source(bag(drive, tmp_path / str(own_clock), Driver(own_clock)), mask_topic=MASK)
+        for own_clock in (False, True)
+    )
+    one, other = (calibrate(source, source.nominal) for source in (relative, own))
+    sigmas = np.sqrt(np.diag(one.covariance))
+    difference = one.T_camera_lidar.localCoordinates(other.T_camera_lidar)
+    assert (np.abs(difference) < 0.1 * sigmas[:6]).all()
+    assert abs(one.time_offset_s - other.time_offset_s) < 0.1 * sigmas[6]
+    assert one.status == other.status
+    said = [reason for reason in other.reasons if "of another clock" in reason]
+    assert len(said) == 1 and said[0] not in one.reasons
+
+
+def test_a_stamp_that_jitters_tells_no_difference(
+    drive: KittiSource, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = bag(drive, tmp_path / "own", Driver(True, jitter_s=0.02))
+    assert "whose difference varies by" in remarks(path)
+    with pytest.raises(DataError, match=r"times up to .*--sweep clockwise"):
+        times_of(path)
+    assert main(["info", str(path), "--mask-topic", MASK]) == 2
+    assert "from the header's stamp" in capsys.readouterr().err
+
+
+def test_info_says_that_the_clock_is_another_one(
+    drive: KittiSource, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["info", str(bag(drive, tmp_path / "own", Driver(True))), "--mask-topic", MASK]) == 0
+    assert "of another clock than the stamps" in " ".join(capsys.readouterr().out.split())
+
+
+def test_clouds_in_files(kitti_drive: Path, tmp_path: Path) -> None:
+    from layouts import as_folder
+
+    folder = as_folder(kitti_drive, tmp_path / "folder", ".npz")
+    after_s = np.linspace(0.0, 0.09, 12)
+    for path in sorted((folder / "clouds").iterdir()):
+        with np.load(path) as arrays:
+            np.savez(path, **arrays, timestamp=float(path.stem) - 1e9 + after_s)
+    for frame in open_source(folder):
+        assert frame.scan is not None and frame.scan.offsets_s is not None
+        np.testing.assert_allclose(frame.scan.offsets_s, after_s, atol=2e-6)
+    facts = facts_of(open_source(folder))
+    assert facts is not None and "1000000000.000 s behind them" in facts.remarks[0]
+
+
+SWEEP = np.linspace(0.0, 0.1, 200)
+
+
+def clock(stamps_ns: NDArray[np.int64], values: list[NDArray[Any]]) -> tuple[PointClock | None, str]:
+    scans = [ScanTimes(int(stamp), of_scan) for stamp, of_scan in zip(stamps_ns, values, strict=True)]
+    return clock_of_points(scans.__getitem__, len(scans), "forward")
+
+
+@pytest.mark.parametrize(
+    ("kind", "unit_ns"), [("<u8", 1), ("<i8", 1000), ("<f8", 10**9), ("<f8", 10**6), ("<f8", 1)]
+)
+@pytest.mark.parametrize("ahead_s", [-1.6e9, -37.0, 37.0, 3e8])
+def test_units_and_differences(kind: str, unit_ns: int, ahead_s: float) -> None:
+    stamps_ns = EPOCH_NS + np.arange(20) * 100_000_000
+    ahead_ns = round(ahead_s * 1e9)
+    values = [
+        ((stamp + ahead_ns + (SWEEP * 1e9).astype(np.int64)) / unit_ns).astype(kind) if kind == "<f8"
+        else ((stamp + ahead_ns + (SWEEP * 1e9).astype(np.int64)) // unit_ns).astype(kind)
+        for stamp in stamps_ns
+    ]  # fmt: skip
+    found, words = clock(stamps_ns, values)
+    assert found is not None and found.unit_ns == unit_ns, words
+    for stamp, of_scan in zip(stamps_ns.tolist(), values, strict=True):
+        seconds = seconds_after_stamp(of_scan, stamp, found)
+        assert seconds is not None
+        np.testing.assert_allclose(seconds, SWEEP, atol=3e-6)
+    assert seconds_after_stamp(np.zeros(5), EPOCH_NS, found) is None
+
+
+def test_what_is_no_clock() -> None:
+    stamps_ns = EPOCH_NS + np.arange(20) * 100_000_000
+    # Times after the stamp, and by its clock; a field of one value.
+    assert clock(stamps_ns, [SWEEP] * 20) == (None, "")
+    assert clock(stamps_ns, [stamp * 1e-9 + SWEEP for stamp in stamps_ns]) == (None, "")
+    assert clock(stamps_ns, [np.full(9, 5.0)] * 20) == (None, "")
+    # Times that stand still, or run twice as fast; too few scans; no unit.
+    assert "runs 0 times as fast" in clock(stamps_ns, [SWEEP + 50.0] * 20)[1]
+    assert "runs 2 times as fast" in clock(stamps_ns, [0.2 * k + 50.0 + SWEEP for k in range(20)])[1]
+    assert "2 scans cannot tell" in clock(stamps_ns[:2], [0.1 * k + 50.0 + SWEEP for k in range(2)])[1]
+    assert "0 scans cannot tell" in clock(stamps_ns, [k + SWEEP * 1e30 + 1e30 for k in range(20)])[1]
+
+
+def test_a_drift_is_followed() -> None:
+    stamps_ns = EPOCH_NS + np.arange(0, 10_000, 10) * 100_000_000
+    passed = (stamps_ns - EPOCH_NS) * 1e-9
+    found, words = clock(stamps_ns, [500.0 + 1.00002 * s + SWEEP for s in passed])
+    assert found is not None and "drift 20.0 ppm" in words
+    seconds = seconds_after_stamp(500.0 + 1.00002 * passed[-1] + SWEEP, int(stamps_ns[-1]), found)
+    assert seconds is not None
+    np.testing.assert_allclose(seconds, SWEEP, atol=1e-5)
