@@ -1,6 +1,6 @@
 """Processor time of a process that only starts, imports or prints its help. Prints a table.
 
-    python -m benchmarks.imports
+python -m benchmarks.imports
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Real drives by motion alone, without a start, at several shifts of the images. Prints a table.
 
-    OMP_NUM_THREADS=1 python -m studies.motion_drives STOP PARKED
+OMP_NUM_THREADS=1 python -m studies.motion_drives STOP PARKED
 """
 
 from __future__ import annotations
