@@ -69,8 +69,6 @@ def with_causes(
     found = preflight(drives, guess, config.classes if by_labels else ())
     causes = [*_wrong_sweeps(drives), *(finding.sentence for finding in found)]
     estimated = bool(result.frames_used)
-    if not causes and result.status != "ok":
-        causes = _of_data(drives, "doubts")
     if not causes and result.status != "ok" and config.method != "motion":
         axes = other_axes(drives)
         causes = [] if axes is None else [axes.sentence]
@@ -88,10 +86,12 @@ def with_causes(
         of_estimate = (remark.sentence for remark in _remarks(result, drives, config))
         remarks = (*_of_data(drives, "remarks"), *of_estimate)
         result = replace(result, reasons=(*result.reasons, *remarks))
-    if causes:
-        status = "not_converged" if estimated else result.status
-        diagnostics = {**result.diagnostics, LIKELY_CAUSES: causes}
-        reasons = (*causes, *result.reasons)
+    # What the data's own names say is no measurement: it changes no status, and hides no cause that is found.
+    doubts = _of_data(drives, "doubts") if causes or result.status != "ok" else []
+    if causes or doubts:
+        status = "not_converged" if estimated and causes else result.status
+        diagnostics = {**result.diagnostics, LIKELY_CAUSES: [*causes, *doubts]}
+        reasons = (*causes, *doubts, *result.reasons)
         result = replace(result, status=status, reasons=reasons, diagnostics=diagnostics)
     return _with_unlabelled_frames(result, drives, config)
 
@@ -105,7 +105,7 @@ def _wrong_sweeps(drives: Sequence[Drive]) -> list[str]:
 def _of_data(drives: Sequence[Drive], what: Literal["remarks", "doubts"]) -> list[str]:
     """What the data of each drive have to say of themselves: a field of their facts."""
     read = [(drive.name, facts_of(drive.frames.source)) for drive in drives if drive.frames is not None]
-    return [f"{name}: {one}" for name, facts in read if facts is not None for one in getattr(facts, what)]
+    return [f"{name}: {one}" for name, facts in read if facts is not None for one in getattr(facts, what, ())]
 
 
 def _with_unlabelled_frames(

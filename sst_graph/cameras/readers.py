@@ -117,15 +117,17 @@ def camera_info_of_size(info: Table, size: tuple[int, int], place: str | Path) -
     Raises:
         DataError: the images have none of these sizes.
     """
-    full = _member(info, "width"), _member(info, "height")
-    if full == (0, 0):
+    full = _member(info, "width", place), _member(info, "height", place)
+    roi = info.get("roi")
+    corner = _member(roi, "x_offset", place), _member(roi, "y_offset", place)
+    # A region off the corner of what has the size of the whole contradicts that size: K may be of either.
+    if full == (0, 0) or (full == size and any(corner)):
         check_full_sensor(info, place)
     table = dict(info) | {"width": size[0], "height": size[1], "binning_x": 0, "binning_y": 0, "roi": None}
     if full in ((0, 0), size):
         return table
-    roi, binning = info.get("roi"), [max(1, _member(info, f"binning_{axis}")) for axis in "xy"]
-    region = _member(roi, "width") or full[0], _member(roi, "height") or full[1]
-    corner = _member(roi, "x_offset"), _member(roi, "y_offset")
+    binning = [max(1, _member(info, f"binning_{axis}", place)) for axis in "xy"]
+    region = _member(roi, "width", place) or full[0], _member(roi, "height", place) or full[1]
     if (region[0] // binning[0], region[1] // binning[1]) != size:
         part = f", a region of {region[0]}x{region[1]} px" if region != full else ""
         binned = f", binned {binning[0]}x{binning[1]}" if max(binning) > 1 else ""
@@ -146,18 +148,25 @@ def check_full_sensor(info: Table, place: str | Path) -> None:
     Raises:
         DataError: it is.
     """
-    width, height, roi = _member(info, "width"), _member(info, "height"), info.get("roi")
-    region = {key: _member(roi, key) for key in ("x_offset", "y_offset", "width", "height")}
-    binned = max(_member(info, "binning_x"), _member(info, "binning_y")) > 1
+    width, height, roi = _member(info, "width", place), _member(info, "height", place), info.get("roi")
+    region = {key: _member(roi, key, place) for key in ("x_offset", "y_offset", "width", "height")}
+    binned = max(_member(info, "binning_x", place), _member(info, "binning_y", place)) > 1
     cut = region["width"] not in (0, width) or region["height"] not in (0, height)
     if binned or cut or region["x_offset"] or region["y_offset"]:
         raise DataError(place, "binning or a region of interest", "images of the full sensor")
 
 
-def _member(group: object, name: str) -> int:
-    """Number in a table or an object, 0 where there is none."""
+def _member(group: object, name: str, place: str | Path) -> int:
+    """Number in a table or an object, 0 where there is none.
+
+    Raises:
+        DataError: no number.
+    """
     value = group.get(name, 0) if isinstance(group, Mapping) else getattr(group, name, 0)
-    return int(value)
+    try:
+        return int(value)
+    except (TypeError, ValueError, OverflowError):
+        raise DataError(place, f"{name}: {value!r:.60}", "a whole number") from None
 
 
 @dataclass(frozen=True)
@@ -195,6 +204,8 @@ def _kalibr_camera(table: Table, place: str) -> KalibrCamera:
     kind, distortion = str(table.get("camera_model")), str(table.get("distortion_model", "none"))
     values = _numbers(_needed(table, "intrinsics", place), f"{place}: intrinsics")
     coefficients = _numbers(table.get("distortion_coeffs", ()), f"{place}: distortion_coeffs")
+    if distortion != "none" and "distortion_coeffs" not in table:
+        raise DataError(place, f"the distortion '{distortion}' without coefficients", "distortion_coeffs")
     width, height = _sides(_needed(table, "resolution", place), f"{place}: resolution")
     own = {"pinhole": 0, "ds": 2}.get(kind)
     if own is None:
@@ -236,7 +247,7 @@ def camera_from_opencv(table: Table, place: str | Path = "camera file") -> Camer
     D = _numbers(_either(table, "distortion_coefficients", "D", place), f"{place}: distortion_coefficients")
     width, height = _whole(table, "image_width", place), _whole(table, "image_height", place)
     # OpenCV writes 5, 8, 12 or 14 coefficients, and no name of the model.
-    usual = "equidistant" if int(table.get("fisheye_model", 0)) else _NAME_BY_LENGTH.get(len(D), "")
+    usual = "equidistant" if _member(table, "fisheye_model", place) else _NAME_BY_LENGTH.get(len(D), "")
     distortion = str(table.get("distortion_model", usual))
     return camera_of(_pinhole(K, width, height, f"{place}: camera_matrix"), distortion, D, place)
 

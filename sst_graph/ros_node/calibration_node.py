@@ -25,7 +25,7 @@ from sst_graph.data.ros.camera_info import (
 from sst_graph.data.ros.clouds import cloud_of
 from sst_graph.data.ros.frames import CloudReading, check_size, mask_classes, scan_of
 from sst_graph.data.ros.images import picture_of
-from sst_graph.data.ros.link_frame import LINK_AXES, is_link, of_link_axes, of_optical_axes
+from sst_graph.data.ros.link_frame import LEAST_SEEN, LINK_AXES, is_link, of_link_axes, of_optical_axes
 from sst_graph.data.ros.topics import CLOUD, COMPRESSED, IMAGE, INFO
 from sst_graph.data.ros.transforms import Transforms
 from sst_graph.data.source import TURNS
@@ -315,12 +315,14 @@ class CalibrationNode:
         return geometry.extrinsic(oTl), 0.0, ""
 
     def _waiting_points(self) -> NDArray[np.float32] | None:
-        """Points (n, 3) of the first cloud that waits and can be used [m]; what is wrong with others is said
-        when they are."""
+        """Points (n, 3) of the first cloud that waits and can be used, not all but empty [m]; what is wrong
+        with others is said when they are."""
         for one in self._queue.peek():
             if one.is_scan:
                 with suppress(Exception):
-                    return cloud_of(one.content, one.stamp_ns, self.lidar.topic, times=False).points
+                    points = cloud_of(one.content, one.stamp_ns, self.lidar.topic, times=False).points
+                    if len(points) >= LEAST_SEEN:
+                        return points
         return None
 
     def _use(self, one: Waiting, now_ns: int) -> TrackUpdate | None:

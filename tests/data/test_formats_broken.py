@@ -13,6 +13,7 @@ import pytest
 from layouts import EPOCH_NS, as_folder, as_kitti_raw, as_nuscenes, raw_stamp, write_raw_calibration
 
 from sst_graph.cameras import BrownConradyCamera
+from sst_graph.cameras.fisheye import FisheyeCamera
 from sst_graph.cli import main
 from sst_graph.data import open_source
 from sst_graph.data.folder.camera_file import read_camera
@@ -244,17 +245,42 @@ def test_cameras_of_other_tools(folder: Path, kind: str) -> None:
             open_source(folder)
 
 
-def test_a_distortion_under_another_name_is_refused_and_not_passed_over(tmp_path: Path) -> None:
-    file, K = tmp_path / "camera.yaml", "K: [700, 0, 4, 0, 701, 3, 0, 0, 1]\nwidth: 8\nheight: 6\n"
-    file.write_text(f"{K}distorsion: [-0.3, 0, 0, 0]\n")
-    with pytest.raises(DataError, match="the key 'distorsion', expected distortion_coefficients"):
-        read_camera(file)
-    file.write_text(f"{K}D: [-0.3, 0, 0, 0]\ndist_coeffs: [0, 0, 0, 0]\n")
-    with pytest.raises(DataError, match="'dist_coeffs' beside another entry for distortion_coefficients"):
-        read_camera(file)
-    file.write_text(f"{K}binning_x: 2\n")
-    with pytest.raises(DataError, match="binning"):
-        read_camera(file)
+K = "K: [700, 0, 4, 0, 701, 3, 0, 0, 1]\nwidth: 8\nheight: 6\n"
+CHAIN = "intrinsics: [700, 701, 4, 3]\nresolution: [8, 6]\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        (f"{K}distorsion: [-0.3, 0, 0, 0]\n", "the key 'distorsion', expected of the lens distortion_coef"),
+        (f"{K}radial_distortion: [-0.3, 0.1]\n", "the key 'radial_distortion'"),
+        (f"{K}coeffs: [-0.3, 0.1, 0, 0]\n", "the key 'coeffs'"),
+        (f"{K}k1: -0.3\nk2: 0.1\n", "the key 'k1'"),
+        (f"{K}D: [-0.3, 0, 0, 0]\ndist_coeffs: [0, 0, 0, 0]\n", "'dist_coeffs' beside another entry"),
+        (f"{CHAIN}distortion: [-0.3, 0.1, 0, 0]\n", "the key 'distortion', expected of the lens"),
+        (f"{CHAIN}distortion_model: radtan\n", "the distortion 'radtan' without coefficients"),
+        (f"{CHAIN}distortion_model: [radtan]\n", "the distortion '.*radtan.*' without coefficients"),
+        (f"{K}binning_x: 2\n", "binning"),
+        (f"{K}binning_x: x\n", "binning_x: 'x', expected a whole number"),
+        (f"{K}binning_x: .nan\n", "binning_x: nan, expected a whole number"),
+        (f"{K}roi: {{x_offset: null}}\n", "x_offset: None, expected a whole number"),
+        (f"{K}fisheye_model: perhaps\n", "fisheye_model: 'perhaps', expected a whole number"),
+    ],
+)
+def test_a_lens_that_is_not_understood_does_not_pass_for_none(tmp_path: Path, text: str, found: str) -> None:
+    (tmp_path / "camera.yaml").write_text(text)
+    with pytest.raises(DataError, match=found):
+        read_camera(tmp_path / "camera.yaml")
+
+
+def test_a_chain_with_the_names_of_euroc_and_a_fisheye_by_a_script(tmp_path: Path) -> None:
+    file, D = tmp_path / "camera.yaml", "[-0.3, 0.1, 0.0, 0.0]"
+    lines = f"{CHAIN}distortion_model: radtan\ndistortion_coefficients: {D}\n"
+    file.write_text("cam0:\n" + "".join(f"  {line}\n" for line in lines.splitlines()))
+    model = read_camera(file)
+    assert isinstance(model, BrownConradyCamera) and model.coefficients[:2] == (-0.3, 0.1)
+    file.write_text(f"{K}D: {D}\nfisheye: true\nP1: [[700, 0, 4, 0], [0, 700, 3, 0], [0, 0, 1, 0]]\n")
+    assert isinstance(read_camera(file), FisheyeCamera)
 
 
 def test_a_camera_is_found_in_a_chain_by_its_name_or_topic(tmp_path: Path) -> None:

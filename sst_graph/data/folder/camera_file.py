@@ -15,7 +15,7 @@ An extrinsic is ``T_camera_lidar`` (4x4), or ``translation`` [m] and ``quaternio
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -45,11 +45,13 @@ _OPENCV = {
     "image_width": ("imagewidth", "width"),
     "image_height": ("imageheight", "height"),
     "image_size": ("imagesize", "resolution"),
+    "fisheye_model": ("fisheyemodel", "fisheye"),
 }
 """OpenCV's names, and others for the same in small letters without underscores."""
 _EUROC = {"distortion_coefficients": "distortion_coeffs", "radial-tangential": "radtan"}
 """EuRoC's names, and Kalibr's for the same."""
-_OF_DISTORTION = ("distortionmodel",)
+_OF_LENS, _COEFFICIENT = re.compile(r".*(dist|coef).*", re.ASCII), re.compile(r"[kp]\d", re.ASCII)
+"""Names of what a lens does, in small letters without underscores; of numbers alone (P1 is a matrix, too)."""
 _ROUNDED = 1e-3
 """A quaternion's length differs from 1 by no more than its digits were rounded."""
 
@@ -75,11 +77,13 @@ def read_camera(path: Path, name: str = "") -> CameraModel:
         coefficients = numbers(table.get("distortion") or [], f"{path} (distortion)")
         return camera_of(intrinsics, str(table.get("distortion_model", "none")), coefficients, path)
     if "intrinsics" in table and "resolution" in table:
-        table = {"cam0": _of_kalibr(table)}
+        table = {"cam0": table}
     chain = {str(key): value for key, value in table.items() if _IN_CHAIN.fullmatch(str(key))}
     if any(isinstance(value, dict) for value in chain.values()):
         key = _of_chain(chain, name, path)
-        return cameras_from_kalibr({key: {"camera_model": "pinhole", **chain[key]}}, path)[key].model
+        own = _of_kalibr(chain[key])
+        _refuse_of_lens(own, ("distortion_coeffs", "distortion_model"), path)
+        return cameras_from_kalibr({key: {"camera_model": "pinhole", **own}}, path)[key].model
     if any(_plain_key(key) in _OPENCV["camera_matrix"] for key in table):
         calibration = _by_opencv_names(table, path)
         check_full_sensor(calibration, path)
@@ -90,9 +94,24 @@ def read_camera(path: Path, name: str = "") -> CameraModel:
 def _of_kalibr(table: Mapping[str, Any]) -> dict[str, Any]:
     """EuRoC's entries of a camera by Kalibr's names."""
     named = {_EUROC.get(str(key), str(key)): value for key, value in table.items()}
-    if named.get("distortion_model") in _EUROC:
-        named["distortion_model"] = _EUROC[named["distortion_model"]]
+    model = named.get("distortion_model")
+    if isinstance(model, str):
+        named["distortion_model"] = _EUROC.get(model, model)
     return named
+
+
+def _refuse_of_lens(table: Mapping[str, Any], known: Collection[str], path: Path) -> None:
+    """Refuse entries of a lens that are not understood: without them the lens would pass for none.
+
+    Raises:
+        DataError: there is one.
+    """
+    for key, value in table.items():
+        plain, single = _plain_key(key), isinstance(value, int | float)
+        if str(key) not in known and (
+            _OF_LENS.fullmatch(plain) or (single and _COEFFICIENT.fullmatch(plain))
+        ):
+            raise DataError(path, f"the key {key!r:.60}", f"of the lens {', '.join(known)}")
 
 
 def _plain_key(key: object) -> str:
@@ -103,18 +122,16 @@ def _by_opencv_names(table: Mapping[str, Any], path: Path) -> dict[str, Any]:
     """The table with OpenCV's names in the place of others for the same.
 
     Raises:
-        DataError: two entries for the same, or one called distortion that is not understood: without it the
-            lens would pass for none.
+        DataError: two entries for the same, or one of the lens that is not understood.
     """
     named: dict[str, Any] = {}
     for key, value in table.items():
         plain = _plain_key(key)
         name = next((name for name, others in _OPENCV.items() if plain in others), None)
-        if name is None and plain.startswith("dist") and plain not in _OF_DISTORTION:
-            raise DataError(path, f"the key {key!r:.60}", "distortion_coefficients, distortion_model")
         if name in named:
             raise DataError(path, f"{key!r:.60} beside another entry for {name}", "one of them")
         named[str(key) if name is None else name] = value
+    _refuse_of_lens(named, ("distortion_coefficients", "distortion_model"), path)
     if "image_size" in named:
         width, height = numbers(named.pop("image_size"), f"{path} (image size)", 2)
         named = {"image_width": width, "image_height": height} | named

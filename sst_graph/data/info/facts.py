@@ -38,7 +38,8 @@ class SourceFacts:
         nominal: where the nominal extrinsic comes from, or why there is none.
         notes: sentences on what else was found.
         remarks: such that concern every result of the drive.
-        doubts: what may be wrong with the data: first reasons of a result that is not ok.
+        doubts: what may be wrong with the data: reasons of a result that is not ok, behind causes that are
+            found.
     """
 
     scan: SensorFacts

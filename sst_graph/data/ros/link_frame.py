@@ -16,8 +16,9 @@ from sst_graph.metrics import FORWARD_R_OPTICAL
 
 LINK_AXES = "x forward, y left, z up"
 _UPWARD = np.cos(np.radians(45.0))
-"""Least cosine between the LiDAR's z axis, or its opposite, and the z axis of a level camera's link."""
-_LEAST_SEEN, _TIMES_MORE = 50, 20.0
+"""Least cosine between the LiDAR's z axis and the z axis of a level camera's link. That of a LiDAR that hangs
+upside down is also that of a camera that looks at the ground: such a frame is believed."""
+LEAST_SEEN, _TIMES_MORE = 50, 20.0
 """Fewest points in the image by the axes of a link, and how many times more they are than by optical axes."""
 
 
@@ -30,10 +31,10 @@ def is_link(name: str, oTl: gtsam.Pose3, points: NDArray[np.float32], model: Cam
         points: (n, 3) of a scan, frame of the LiDAR [m].
         model: of the camera that took the images.
     """
-    if "optical" in name.lower() or abs(float(oTl.rotation().matrix()[2, 2])) < _UPWARD:
+    if "optical" in name.lower() or float(oTl.rotation().matrix()[2, 2]) < _UPWARD:
         return False
     by_link = _seen(of_optical_axes(oTl), points, model)
-    return by_link >= _LEAST_SEEN and by_link > _TIMES_MORE * _seen(oTl, points, model)
+    return by_link >= LEAST_SEEN and by_link > _TIMES_MORE * _seen(oTl, points, model)
 
 
 def of_optical_axes(linkTl: gtsam.Pose3) -> gtsam.Pose3:

@@ -24,7 +24,7 @@ from sst_graph.data.ros.clouds import cloud_of, field_names, times_of
 from sst_graph.data.ros.frames import CloudReading, check_size, mask_classes, scan_of
 from sst_graph.data.ros.images import mask_of, picture_of
 from sst_graph.data.ros.index import BagIndex, Stamped, read_index
-from sst_graph.data.ros.link_frame import LINK_AXES, is_link, of_optical_axes
+from sst_graph.data.ros.link_frame import LEAST_SEEN, LINK_AXES, is_link, of_optical_axes
 from sst_graph.data.ros.moving_frame import check_moves_along
 from sst_graph.data.ros.topics import Topics, choose_topics
 from sst_graph.data.source import Loader, SourceOptions
@@ -39,6 +39,8 @@ _LOG = logging.getLogger(__name__)
 LAYOUT = "a bag: PATH.bag, PATH.mcap, PATH.db3, or a rosbag2 folder"
 
 _SUFFIXES, _METADATA = (".bag", ".mcap", ".db3"), "metadata.yaml"
+_CLOUDS_TO_JUDGE = 8
+"""How many clouds, spread over the drive, are looked at until one shows the axes of the images' frame."""
 _MASKS_TO_JUDGE = 8
 """How many masks, spread over the drive, decide on their encoding."""
 
@@ -235,12 +237,17 @@ def _extrinsic(
     oTl, reason = index.transforms.pose(index.image_frame, index.cloud_frame)
     if oTl is None:
         return None, reason
-    first, frame = index.clouds[0], index.image_frame
-    message = _read(bag, topics, index, first, topics.cloud.type)
-    points = cloud_of(message, first.stamp_ns, _place(bag, first), times=False).points
-    if not is_link(frame, oTl, points, geometry.model):
-        return oTl, reason
-    return of_optical_axes(oTl), f"{reason}; {frame!r} shows to be the camera's link ({LINK_AXES})"
+    frame = index.image_frame
+    for place in evenly_spread(index.clouds, _CLOUDS_TO_JUDGE):
+        message = _read(bag, topics, index, place, topics.cloud.type)
+        points = cloud_of(message, place.stamp_ns, _place(bag, place), times=False).points
+        # A LiDAR that starts up sends clouds that are all but empty.
+        if len(points) >= LEAST_SEEN:
+            if is_link(frame, oTl, points, geometry.model):
+                oTl, why = of_optical_axes(oTl), f"{frame!r} shows to be the camera's link ({LINK_AXES})"
+                reason = f"{reason}; {why}"
+            break
+    return oTl, reason
 
 
 def _size(bag: Bag, topics: Topics, index: BagIndex) -> tuple[int, int]:

@@ -94,8 +94,10 @@ class Transforms:
 
     def moves(self, one: str, other: str) -> bool:
         """Whether a frame moves against another, by the chain that joins them; where none does, whether it
-        moves against any frame that it has a transform with."""
-        path = self._path(one, other) if one != other else None
+        moves against any frame that it has a transform with. No frame moves against itself."""
+        if one == other:
+            return False
+        path = self._path(one, other)
         if path is None:
             return any(one in edge for edge in self._moving)
         return any(edge in self._moving or edge[::-1] in self._moving for edge in pairwise(path))

@@ -40,7 +40,8 @@ def ground_and_wall() -> np.ndarray:
 POINTS = ground_and_wall()
 
 
-def bag_with(path: Path, frame: str, frameTl: gtsam.Pose3) -> Path:
+def bag_with(path: Path, frame: str, frameTl: gtsam.Pose3, empty: int = 0) -> Path:
+    """A drive of two scans, of which so many are all but empty."""
     table = np.zeros(len(POINTS), [(axis, "<f4") for axis in "xyz"])
     for axis, values in zip("xyz", POINTS.T, strict=True):
         table[axis] = values
@@ -52,7 +53,7 @@ def bag_with(path: Path, frame: str, frameTl: gtsam.Pose3) -> Path:
             stamp_ns = EPOCH_NS + k * 100_000_000
             image = make.image(stamp_ns, np.full((360, 640, 3), 60, np.uint8))
             bag.add(IMAGE, replace(image, header=make.header(stamp_ns, frame)), stamp_ns)
-            bag.add(CLOUD, make.cloud(stamp_ns, table), stamp_ns)
+            bag.add(CLOUD, make.cloud(stamp_ns, table[:10] if k < empty else table), stamp_ns)
     return path
 
 
@@ -68,6 +69,12 @@ def test_the_pose_in_the_link_becomes_that_in_the_optical_axes(frame: str, tmp_p
     assert f"{frame!r} shows to be the camera's link (x forward" in reason_of(source)
 
 
+def test_a_first_cloud_that_is_all_but_empty_decides_nothing(tmp_path: Path) -> None:
+    """As of a LiDAR that starts up."""
+    source = open_source(bag_with(tmp_path / "drive", "camera_link", LINK_T_LIDAR, empty=1))
+    assert source.nominal is not None and source.nominal.equals(OPTICAL_T_LIDAR, 1e-9)
+
+
 def test_optical_axes_stay_whatever_their_frame_is_called(tmp_path: Path) -> None:
     source = open_source(bag_with(tmp_path / "drive", "camera_link", OPTICAL_T_LIDAR))
     assert source.nominal is not None and source.nominal.equals(OPTICAL_T_LIDAR, 1e-9)
@@ -81,6 +88,9 @@ def test_only_what_shows_to_be_a_link_is_one() -> None:
     down = gtsam.Pose3(gtsam.Rot3.Rx(np.pi), np.zeros(3))
     nearer = POINTS * np.float32([0.1, 0.1, 1.0])
     assert not is_link("camera", down, np.concatenate([POINTS, nearer]), LENS)
+    # The same where the LiDAR has no point in its picture.
+    far = POINTS[np.linalg.norm(POINTS[:, :2], axis=1) > 10.0]
+    assert not is_link("camera", down, far, LENS)
     ahead = POINTS[POINTS[:, 0] > 3.0]
     behind = gtsam.Pose3(gtsam.Rot3.Rz(np.pi), np.zeros(3)) * LINK_T_LIDAR
     assert not is_link("camera", behind, ahead, LENS)

@@ -367,6 +367,10 @@ def test_images_of_another_size_than_the_region_binned() -> None:
         image_geometry(info, "/cam/image_raw", (320, 180), "here")
     with pytest.raises(DataError, match="binning or a region of interest, expected images of the full"):
         image_geometry(replace(info, width=0, height=0), "/cam/image_raw", (320, 180), "here")
+    # The region's size stands beside an offset from the corner: whose K is it?
+    part = MAKE.info(CAMERA, roi=region(40, 100, CAMERA.width, CAMERA.height))
+    with pytest.raises(DataError, match="binning or a region of interest, expected images of the full"):
+        image_geometry(part, "/cam/image_raw", (CAMERA.width, CAMERA.height), "here")
 
 
 def test_a_mask_of_inexact_numbers_is_refused() -> None:

@@ -21,7 +21,7 @@ from sst_graph.data.info.facts import facts_of
 from sst_graph.data.ros.transforms import Transforms
 from sst_graph.drive.preparation import prepare_drive
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.result import CalibrationResult
+from sst_graph.result import CalibrationResult, FrameId
 from sst_graph.types import Guess
 
 CAMERA = PinholeCamera(30.0, 30.0, 16.0, 12.0, 32, 24)
@@ -86,11 +86,13 @@ def test_a_name_alone_or_transforms_alone_are_named(tmp_path: Path) -> None:
     # Objects that are tracked move against the LiDAR, and the vehicle in the world.
     assert doubts(bag(tmp_path / "object", "lidar", ("lidar", "car_1"), ("lidar", CAMERA_FRAME))) == ""
     assert doubts(bag(tmp_path / "vehicle", "lidar", ("odom", "lidar"), ("lidar", CAMERA_FRAME))) == ""
+    # Images and clouds in one frame, which moves in the world.
+    assert doubts(bag(tmp_path / "one", CAMERA_FRAME, ("odom", CAMERA_FRAME), None)) == ""
     # A vehicle that stands still.
     assert doubts(bag(tmp_path / "still", "camera_link", None, ("camera_link", CAMERA_FRAME))) == ""
 
 
-def test_a_doubt_is_the_first_reason_of_a_result_that_is_not_ok(tmp_path: Path) -> None:
+def test_a_doubt_is_a_reason_of_a_result_that_is_not_ok(tmp_path: Path) -> None:
     source = open_source(bag(tmp_path / "drive", "world", None, None))
     drive, config = prepare_drive(source, []), CalibrationConfig(method="edges", find_causes=False)
     result = CalibrationResult(
@@ -104,6 +106,13 @@ def test_a_doubt_is_the_first_reason_of_a_result_that_is_not_ok(tmp_path: Path) 
     )
     reasons = with_causes(result, [drive], Guess(None, 0.0), config).reasons
     assert reasons[0] == f"drive: {doubts(tmp_path / 'drive')}" and "no match" in reasons
+    # It is no measurement: a status stays, and a cause that is found stands before it.
+    estimated = replace(result, frames_used=(FrameId("drive", 0),))
+    assert with_causes(estimated, [drive], Guess(None, 0.0), config).status == "unobservable"
+    far = Guess(gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, 3000.0])), 0.0)
+    found = with_causes(estimated, [drive], far, config)
+    where = [k for k, reason in enumerate(found.reasons) if "called as one that stays" in reason]
+    assert where == [1] and found.status == "not_converged"
     fine = with_causes(replace(result, status="ok"), [drive], Guess(None, 0.0), config).reasons
     assert not any("called as one that stays" in reason for reason in fine)
 
