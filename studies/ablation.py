@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import time
@@ -113,7 +114,7 @@ def street(simulator: str, seed: int, frames: int) -> KeptDrive:
     common: dict[str, Any] = {"seed": seed, "frames": frames, "time_offset_s": TIME_OFFSET_S}
     common |= {"width": 621, "height": 188, "moving_fraction": 0.2}
     if simulator == "first":
-        sparse = {"azimuth_step_deg": 0.3, "azimuth_limit_deg": 60.0, "vehicle_density": 0.25}
+        sparse: dict[str, Any] = {"azimuth_step_deg": 0.3, "azimuth_limit_deg": 60.0, "vehicle_density": 0.25}
         motion: Any = "stop_and_go" if stops else "mixed"
         return KeptDrive.of(simulate(SimulationConfig(motion=motion, **common, **sparse)))
     common |= {"focal_px": 360.75, "motion": "stop" if stops else "vary", "density": 0.2}
@@ -174,15 +175,17 @@ class Runner:
 
 
 def read_records(path: Path) -> list[dict[str, Any]]:
-    """Runs that a file has; the last line may have been cut off by a kill."""
+    """Runs that a file has; none of a line that a kill has cut off."""
     if not path.exists():
         return []
-    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-    return [json.loads(line) for line in lines if line.endswith("\n")]
+    whole, _, _ = path.read_text(encoding="utf-8").rpartition("\n")
+    return [json.loads(line) for line in whole.splitlines()]
 
 
 def run(path: Path, drives: Sequence[Data], cases: Sequence[Case], method: str) -> None:
     """Append the runs that a file does not have."""
+    if path.exists():
+        os.truncate(path, path.read_bytes().rfind(b"\n") + 1)
     known = {(one["method"], one["data"], one["case"]) for one in read_records(path)}
     commit = _git("rev-parse", "--short", "HEAD")
     for data in drives:

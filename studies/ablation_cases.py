@@ -971,6 +971,20 @@ COVARIANCE: tuple[Case, ...] = (
         lines=("drive/stamp_intervals.py", "batch/method_estimate.py:held_offsets"),
         more_lines=60,
     ),
+    Case(
+        "frame_gains",
+        "what each frame tells, in the diagnostics",
+        changes={"inspect.frame_gains:frame_gains": answering(())},
+        lines=("inspect/frame_gains.py", "inspect/frame_information.py"),
+        more_lines=4,
+    ),
+    Case(
+        "fit",
+        "how the estimate fits the labels, in the result",
+        changes={"batch.joint_report:fit_of": answering(None)},
+        lines=("quality/fit_of_solution.py", "quality/close_points.py", "quality/residuals.py"),
+        more_lines=25,
+    ),
 )
 
 BY_EDGES: tuple[Case, ...] = (
@@ -1219,6 +1233,22 @@ START: tuple[Case, ...] = (
         "narrow kernels from a start that was searched (the whole schedule)",
         changes={"graph.outer_loop:NARROW_KERNELS_PX": to(KERNELS_PX)},
         more_lines=4,
+        methods=(SEARCH,),
+    ),
+    Case(
+        "search_agreement",
+        "least agreement of labels, in the status",
+        changes={"graph.outer_loop:poor_fit": answering([])},
+        lines=("graph/outer_loop.py:poor_fit", "graph/outer_loop.py:concentration"),
+        more_lines=20,
+        methods=(SEARCH,),
+    ),
+    Case(
+        "search_alternatives",
+        "other solutions that agree nearly as well, in the status",
+        changes={"batch.joint_report:_alternatives": answering(())},
+        lines=("batch/joint_report.py:_alternatives",),
+        more_lines=8,
         methods=(SEARCH,),
     ),
 )
