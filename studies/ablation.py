@@ -38,7 +38,7 @@ from sst_graph.experiments.markdown import NONE, status_counts, table
 from sst_graph.experiments.starts import error_of, start_near
 from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.types import GroundTruth
-from studies.ablation_cases import CASES, EDGES, JOINT, NOTHING, SEARCH, Case
+from studies.ablation_cases import CASES, EDGES, JOINT, LEAN, NOTHING, SEARCH, Case, base_of
 from studies.simulators.second_street import SecondStreet, StreetConfig
 from studies.simulators.third_street import ThirdConfig, ThirdStreet
 
@@ -150,7 +150,7 @@ class Runner:
         start, time_offset_s = data.start(self._method)
         drives, prepare_s = self._drives(case, config)
         began = time.process_time()
-        with case.left_out():
+        with base_of(case, self._method).left_out(), case.left_out():
             result = calibrate_prepared(drives, start, config, initial_time_offset_s=time_offset_s)
         seconds = time.process_time() - began
         return {
@@ -356,9 +356,10 @@ def _ratio_cell(ratios: FloatArray) -> str:
 def comparisons(records: Sequence[dict[str, Any]], method: str) -> list[Comparison]:
     """Every case that was run by a method, against the full method; those with the most lines first."""
     own = {(one["case"], one["data"]): one for one in records if one["method"] == method}
-    full = {data: Run.of(one) for (case, data), one in own.items() if case == NOTHING.name and "error" in one}
     found = []
     for case in CASES[1:]:
+        base = base_of(case, method).name
+        full = {data: Run.of(one) for (name, data), one in own.items() if name == base and "error" in one}
         made = {data: one for (name, data), one in own.items() if name == case.name and data in full}
         pairs = [(full[data], Run.of(one)) for data, one in made.items() if "error" in one]
         if pairs:
@@ -460,6 +461,7 @@ def cases_of(names: str, method: str) -> list[Case]:
     """
     own = [case for case in CASES if method in case.methods]
     chosen = {NOTHING.name, *(names.split(",") if names else (case.name for case in own))}
+    chosen |= {LEAN.name} if method == JOINT else set()
     if unknown := chosen - {case.name for case in own}:
         raise SystemExit(f"found cases {sorted(unknown)}, expected some of {[case.name for case in own]}")
     return [case for case in own if case.name in chosen]

@@ -134,6 +134,11 @@ def lines_of(place: str) -> int:
     return sum(bool(row.strip()) for row in rows)
 
 
+def base_of(case: Case, method: str) -> Case:
+    """What a case is compared with: where the cases by labels are left out of :data:`LEAN`, that."""
+    return NOTHING if method != JOINT or case in (NOTHING, LEAN, *DIAGNOSTICS) else LEAN
+
+
 def to(value: Any) -> Change:
     """This value in place of the original."""
     return lambda _: value
@@ -930,21 +935,6 @@ COVARIANCE: tuple[Case, ...] = (
         methods=_BOTH,
     ),
     Case(
-        "lens_beside_labels",
-        "test of the principal point by edges of some frames",
-        changes={"batch.calibrate:lens_beside_labels": answering(())},
-        lines=(
-            "batch/by_edges/lens.py:lens_beside_labels",
-            "batch/by_edges/lens.py:_may_contradict",
-            "batch/assumption_tests.py:with_further_tests",
-            "drive/edges_of_frames.py",
-            "batch/by_edges/problem.py:problem_of_some_frames",
-            "batch/by_edges/problem.py:_with_some_edges",
-            "batch/by_edges/problem.py:_some_pairs",
-        ),
-        more_lines=25,
-    ),
-    Case(
         "few_objects_in_tests",
         "Student's t in the tests of assumptions",
         changes={"batch.assumption_tests:few_objects_factor": answering(1.0)},
@@ -970,20 +960,6 @@ COVARIANCE: tuple[Case, ...] = (
         settings=("check_stamps=false",),
         lines=("drive/stamp_intervals.py", "batch/method_estimate.py:held_offsets"),
         more_lines=60,
-    ),
-    Case(
-        "frame_gains",
-        "what each frame tells, in the diagnostics",
-        changes={"inspect.frame_gains:frame_gains": answering(())},
-        lines=("inspect/frame_gains.py", "inspect/frame_information.py"),
-        more_lines=4,
-    ),
-    Case(
-        "fit",
-        "how the estimate fits the labels, in the result",
-        changes={"batch.joint_report:fit_of": answering(None)},
-        lines=("quality/fit_of_solution.py", "quality/close_points.py", "quality/residuals.py"),
-        more_lines=25,
     ),
 )
 
@@ -1253,9 +1229,52 @@ START: tuple[Case, ...] = (
     ),
 )
 
+DIAGNOSTICS: tuple[Case, ...] = (
+    Case(
+        "lens_beside_labels",
+        "test of the principal point by edges of some frames",
+        changes={"batch.calibrate:lens_beside_labels": answering(())},
+        lines=(
+            "batch/by_edges/lens.py:lens_beside_labels",
+            "batch/by_edges/lens.py:_may_contradict",
+            "batch/assumption_tests.py:with_further_tests",
+            "drive/edges_of_frames.py",
+            "batch/by_edges/problem.py:problem_of_some_frames",
+            "batch/by_edges/problem.py:_with_some_edges",
+            "batch/by_edges/problem.py:_some_pairs",
+        ),
+        more_lines=25,
+    ),
+    Case(
+        "frame_gains",
+        "what each frame tells, in the diagnostics",
+        changes={"inspect.frame_gains:frame_gains": answering(())},
+        lines=("inspect/frame_gains.py", "inspect/frame_information.py"),
+        more_lines=4,
+    ),
+    Case(
+        "fit",
+        "how the estimate fits the labels, in the result",
+        changes={"batch.joint_report:fit_of": answering(None)},
+        lines=("quality/fit_of_solution.py", "quality/close_points.py", "quality/residuals.py"),
+        more_lines=25,
+    ),
+)
+"""They cost a third of the time, and change neither estimate nor covariance: the status at most."""
+
 NOTHING = Case("nothing", "nothing", methods=(JOINT, EDGES, SEARCH))
+LEAN = Case(
+    "lean",
+    "the principal point's test, what each frame tells, and the fit together",
+    changes={place: change for case in DIAGNOSTICS for place, change in case.changes.items()},
+    lines=[place for case in DIAGNOSTICS for place in case.lines],
+    more_lines=sum(case.more_lines for case in DIAGNOSTICS),
+)
+"""The full method without the diagnostics: the other cases by labels are left out of it, to save time."""
 CASES: tuple[Case, ...] = (
     NOTHING,
+    LEAN,
+    *DIAGNOSTICS,
     *FEATURES,
     *MATCHES,
     *OBJECTS,

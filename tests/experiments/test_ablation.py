@@ -104,7 +104,7 @@ def record(case: str, error: float, sigma: float = 0.01, data: str = "first-9300
     ],
 )
 def test_a_verdict_is_by_errors_nees_and_silent_ones(error: float, sigma: float, verdict: str) -> None:
-    (found,) = ablation.comparisons([record("nothing", 0.01), record("roofs", error, sigma)], "joint")
+    (found,) = ablation.comparisons([record("lean", 0.01), record("roofs", error, sigma)], "joint")
     assert (found.case.name, found.verdict) == ("roofs", verdict)
 
 
@@ -139,8 +139,8 @@ def test_two_cases_on_a_tiny_street_make_a_table(tmp_path: Path, capsys: pytest.
     printed = capsys.readouterr().out
     assert "`roofs`" in printed and "`clusters`" in printed and "| third | 1 |" in printed
     records = [json.loads(line) for line in runs.read_text().splitlines()]
-    assert [one["case"] for one in records] == ["nothing", "roofs", "clusters"]
-    assert records[0]["error"] == records[2]["error"] != records[1]["error"]
+    assert [one["case"] for one in records] == ["nothing", "lean", "roofs", "clusters"]
+    assert records[0]["error"] == records[1]["error"] == records[3]["error"] != records[2]["error"]
     # What the file has is not run again; a line that was cut off is.
     content = runs.read_text()
     runs.write_text(content + '{"method": "jo')
