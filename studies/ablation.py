@@ -61,8 +61,8 @@ decide [rad, m, s]."""
 _SILENT_SIGMAS = 3.0
 _LEAST_RATIO, _MOST_RATIO = 0.9, 1.1
 """Ratios of errors between which a heuristic makes no difference."""
-_NEES_CHANGE = 0.1
-"""Relative change of the mean NEES up to which it is the same."""
+_NEES_RATIO = 1.2
+"""Ratio of the mean NEES, or its inverse, up to which it is the same: that of errors, squared."""
 _LONGEST_REASON = 120
 
 
@@ -299,18 +299,18 @@ class Comparison:
             return "idle"
         kinds = dict.fromkeys(full.kind for full, _ in self.pairs)
         ratios = [float(np.exp(self.ratios(kind).mean())) for kind in kinds]
+        nees = [
+            (_mean_nees(full), _mean_nees(other)) for full, other in map(self.both, (True, False)) if full
+        ]
+        surer = any(other > max(1.0, _NEES_RATIO * full) for full, other in nees)
         silent = [sum(pair[k].silent for pair in self.pairs) for k in (0, 1)]
         fine = [sum(pair[k].status == "ok" for pair in self.pairs) for k in (0, 1)]
-        if max(ratios) > _MOST_RATIO or silent[1] > silent[0] or fine[1] < fine[0]:
+        if max(ratios) > _MOST_RATIO or surer or silent[1] > silent[0] or fine[1] < fine[0]:
             return "stays"
         if min(ratios) < _LEAST_RATIO:
             return "better"
-        alike = all(self._same_nees(streets) for streets in (True, False))
+        alike = all(1.0 / _NEES_RATIO < other / full < _NEES_RATIO for full, other in nees)
         return "goes" if alike and silent[0] == silent[1] else "stays"
-
-    def _same_nees(self, streets: bool) -> bool:
-        with_, without = (_mean_nees(runs) for runs in self.both(streets))
-        return not with_ or abs(without / with_ - 1.0) < _NEES_CHANGE
 
     def cells(self, kinds: Sequence[str]) -> list[str]:
         """The row of a table."""
