@@ -449,7 +449,6 @@ MATCHES: tuple[Case, ...] = (
         changes={"association.edge_matching:_MIN_COSINE": to(-2.0)},
         lines=("association/edge_matching.py:faces",),
         more_lines=6,
-        methods=_BOTH,
     ),
     Case(
         "object_share",
@@ -457,7 +456,6 @@ MATCHES: tuple[Case, ...] = (
         changes={"association.edge_matching:MIN_OBJECT_SHARE": to(0.0)},
         lines=("association/edge_matching.py:of_matched_objects",),
         more_lines=4,
-        methods=_BOTH,
     ),
     Case(
         "beam_sigma",
@@ -642,7 +640,6 @@ ODOMETRY: tuple[Case, ...] = (
         "no motion at standstill",
         changes={"odometry.standstill:ZeroVelocityUpdate.apply": _as_they_are},
         lines=("odometry/standstill.py",),
-        methods=_BOTH,
     ),
     Case(
         "parked_in_odometry",
