@@ -425,23 +425,27 @@ def commit_of(records: Sequence[dict[str, Any]]) -> str:
 
 
 def write_into(page: Path, records: Sequence[dict[str, Any]]) -> None:
-    """Write the tables into the blocks of a page whose command is a run of their method."""
+    """Write tables into those blocks of a page whose command runs this program."""
     text = page.read_text(encoding="utf-8")
     for block in make_tables.tables_of(page):
-        method = method_of(block.command)
-        if method:
-            own = [one for one in records if one["method"] == method]
-            body = make_tables.body(block.command, tables(own, method), commit_of(own))
+        _, found, words = block.command.partition("studies.ablation ")
+        if found:
+            args = parsed(words.split())
+            own = chosen(records, args)
+            body = make_tables.body(block.command, tables(own, args.method), commit_of(own))
             text = make_tables.replaced(text, block.command, body)
     page.write_text(text, encoding="utf-8")
 
 
-def method_of(command: str) -> str:
-    """Method of a command that runs this program; "" of any other."""
-    words = command.split()
-    if "studies.ablation" not in words or "run" not in words:
-        return ""
-    return words[words.index("--method") + 1] if "--method" in words else JOINT
+def chosen(records: Sequence[dict[str, Any]], args: argparse.Namespace) -> list[dict[str, Any]]:
+    """The runs that a ``run`` of these arguments makes."""
+    names = {data.name for data in data_of(args.streets, args.drive, args.frames)}
+    cases = {case.name for case in cases_of(args.cases, args.method)}
+    return [
+        one
+        for one in records
+        if one["method"] == args.method and one["data"] in names and one["case"] in cases
+    ]
 
 
 def _git(*words: str) -> str:
@@ -475,8 +479,8 @@ def cases_of(names: str, method: str) -> list[Case]:
     return [case for case in own if case.name in chosen]
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """``run`` or ``table``."""
+def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Arguments of ``run`` or ``table``."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
     runner = commands.add_parser("run")
@@ -489,15 +493,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
     writer = commands.add_parser("table")
     writer.add_argument("runs", type=Path)
     writer.add_argument("--into", required=True, type=Path)
-    args = parser.parse_args(arguments)
+    return parser.parse_args(arguments)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """``run`` or ``table``."""
+    args = parsed(arguments)
     if args.command == "table":
         write_into(args.into, read_records(args.runs))
         return
     cv2.setNumThreads(1)
+    args.out.parent.mkdir(parents=True, exist_ok=True)
     drives, cases = list(data_of(args.streets, args.drive, args.frames)), cases_of(args.cases, args.method)
     run(args.out, drives, cases, args.method)
-    names = {data.name for data in drives}
-    print(tables([one for one in read_records(args.out) if one["data"] in names], args.method))
+    print(tables(chosen(read_records(args.out), args), args.method))
 
 
 if __name__ == "__main__":

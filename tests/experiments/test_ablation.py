@@ -17,7 +17,7 @@ from studies.ablation_cases import CASES, NOTHING, Case, replaced, to
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 PAGE = """# Worth
 
-<!-- table: python -m studies.ablation run --out out/ablation.jsonl --streets third:1 -->
+<!-- table: python -m studies.ablation run --out out/ablation.jsonl --streets third:1 --frames 6 -->
 <!-- end of table -->
 
 <!-- table: sst-graph experiment fit -->
