@@ -1100,7 +1100,7 @@ BY_EDGES: tuple[Case, ...] = (
         "least agreement of edges, against other poses and other starts",
         changes={
             "batch.by_edges.reasons:MIN_CONTRAST": to(-1e9),
-            "batch.by_edges.reasons:MIN_OVER_OTHER": to(0.0),
+            "batch.by_edges.reasons:MIN_OVER_OTHER": to(1e-9),
         },
         lines=("batch/by_edges/reasons.py:edge_contrast", "edges/turns.py"),
         more_lines=30,
