@@ -64,7 +64,9 @@ _SILENT_SIGMAS = 3.0
 _LEAST_RATIO, _MOST_RATIO = 0.9, 1.1
 """Ratios of errors between which a heuristic makes no difference."""
 _NEES_RATIO = 1.2
-"""Ratio of the mean NEES, or its inverse, up to which it is the same: that of errors, squared."""
+"""Ratio of the mean NEES up to which it is the same: that of errors, squared."""
+_SURPRISE = 0.05
+"""Change of the surprise up to which covariances are as good [nats]."""
 _LONGEST_REASON = 120
 
 
@@ -292,6 +294,12 @@ class Comparison:
         )
 
     @property
+    def surprise(self) -> float:
+        """Mean change of the surprise on streets [nats]; 0 without any."""
+        changes = [other.surprise - full.surprise for full, other in zip(*self.both(True), strict=True)]
+        return float(np.mean(changes)) if changes else 0.0
+
+    @property
     def verdict(self) -> str:
         """``goes`` where leaving it out changes nothing that counts, ``better`` where it improves errors and
         worsens nothing, ``idle`` where no run differs; ``open`` where errors change on some data, but not on
@@ -312,8 +320,7 @@ class Comparison:
             return "stays"
         if min(ratios) < _LEAST_RATIO and max(ratios) <= _MOST_RATIO:
             return "better"
-        alike = all(1.0 / _NEES_RATIO < other / full < _NEES_RATIO for full, other in nees)
-        if not (alike and silent[0] == silent[1]):
+        if self.surprise > _SURPRISE:
             return "stays"
         if max(ratios) <= _MOST_RATIO:
             return "goes"
@@ -323,7 +330,6 @@ class Comparison:
         """The row of a table."""
         fulls, others = (list(side) for side in zip(*self.pairs, strict=True))
         street_runs, drive_runs = self.both(True), self.both(False)
-        worse = [other.surprise - full.surprise for full, other in zip(*street_runs, strict=True)]
         fine = [sum(one.status == "ok" for one in runs) for runs in (fulls, others)]
         silent = [sum(one.silent for one in runs) for runs in (fulls, others)]
         cost = sum(one.seconds for one in others) / sum(one.seconds for one in fulls)
@@ -334,7 +340,7 @@ class Comparison:
             _ratio_cell(self.ratios()),
             *(_ratio_cell(self.ratios(kind)) for kind in kinds),
             _arrow(*map(_mean_nees, street_runs)) if street_runs[0] else NONE,
-            f"{np.mean(worse):+.2f}" if worse else NONE,
+            f"{self.surprise:+.2f}" if street_runs[0] else NONE,
             _arrow(*map(_mean_nees, drive_runs)) if drive_runs[0] else NONE,
             f"{fine[0]} → {fine[1]}",
             f"{silent[0]} → {silent[1]}",
