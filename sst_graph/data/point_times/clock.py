@@ -39,7 +39,7 @@ _NEAR_THE_END = 0.1
 """Share of the scans whose first return comes before the start of the sweep that is taken: stamps jitter, and
 the first return is missing in others."""
 _ON_ARRIVAL = 0.7
-"""A message that arrives within this share of a sweep after its stamp has not the stamp of its start."""
+"""Messages that arrive within this share of a sweep after their stamp have not the stamp of its start."""
 _SIGNIFICANT = 3.0
 _OF_MEDIAN = 1.4826
 """Standard deviation of a normal distribution by its median absolute deviation."""
@@ -52,7 +52,7 @@ class ScanTimes:
     Attributes:
         stamp_ns: of the scan.
         values: (n,) in some unit; of points that are used.
-        received_ns: when the recorder got the scan, where that is known.
+        received_ns: when the recorder got the scan, where that is known apart from the stamp.
     """
 
     stamp_ns: int
@@ -115,8 +115,10 @@ def clock_of_points(
     """The clock of a drive's points, where it is another one than that of the stamps, and a sentence on it;
     without a clock, on why it is not known; empty where the times are of the stamps' clock.
 
-    Which instant a stamp names is a convention that no data show for certain: a scan that is received sooner
-    after its stamp than a sweep lasts has the stamp of its end. Otherwise it is that of the start.
+    Single scans do not make it another clock: most have to be far from their stamps.
+
+    Which instant a stamp names is a convention that no data show for certain: where scans are received within
+    0.7 of a sweep after their stamps (median), these are those of the ends. Otherwise they are of the starts.
 
     Args:
         read: times of scan k; None where it has none.
@@ -127,6 +129,10 @@ def clock_of_points(
     if not any(times.are_far() for times in looked_at):
         return None, ""
     scans = [times for k in evenly_spread(range(count), _COMPARED) if (times := read(k)) is not None]
+    telling = sum(not tells_nothing(times.values) for times in scans)
+    scans = [times for times in scans if times.are_far()]
+    if 2 * len(scans) <= telling:
+        return None, ""
     units = Counter(unit for times in scans if (unit := times.unit_ns()))
     unit_ns = max(units, key=lambda unit: units[unit], default=0)
     scans = [times for times in scans if times.unit_ns() == unit_ns]
@@ -187,7 +193,7 @@ def _named_instant(scans: Sequence[ScanTimes], sweep_s: float) -> SweepStamp:
     after_s = [
         (times.received_ns - times.stamp_ns) * 1e-9 for times in scans if times.received_ns is not None
     ]
-    return "end" if after_s and 0.0 <= min(after_s) < _ON_ARRIVAL * sweep_s else "start"
+    return "end" if after_s and 0.0 <= float(np.median(after_s)) < _ON_ARRIVAL * sweep_s else "start"
 
 
 def _seconds(ends: NDArray[Any], unit_ns: int) -> float:
