@@ -47,9 +47,7 @@ _DATES_NS = (10**18, 42 * 10**17)
 _OTHER_UNITS_NS = (1_000, 1_000_000)
 _OF_PART_NS = {9: 1, 6: 1_000}
 """Unit of the part behind seconds [ns], by the digits of the longest: zeros before the others may lack."""
-_STAMP = (
-    "seconds with a decimal point, whole nanoseconds, dates in whole microseconds or milliseconds, or sec_nsec"
-)
+_STAMP = "seconds with a decimal point, whole nanoseconds, dates in microseconds or milliseconds, or sec_nsec"
 _LINE = f"name,stamp or stamp,name (or name,sec,nsec); the stamp in {_STAMP}"
 
 

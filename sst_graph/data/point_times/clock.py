@@ -26,6 +26,7 @@ from sst_graph.data.point_times.seconds import (
 )
 from sst_graph.errors import count_of
 from sst_graph.sampling import evenly_spread
+from sst_graph.spread import robust_spread
 from sst_graph.sweep_timing import SweepStamp
 from sst_graph.types import FloatArray
 
@@ -41,8 +42,6 @@ the first return is missing in others."""
 _ON_ARRIVAL = 0.7
 """Messages that arrive within this share of a sweep after their stamp have not the stamp of its start."""
 _SIGNIFICANT = 3.0
-_OF_MEDIAN = 1.4826
-"""Standard deviation of a normal distribution by its median absolute deviation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,15 +176,11 @@ def _drift(passed: FloatArray, ahead: FloatArray) -> tuple[float, float]:
     deviation about it [s]; by medians (Theil, Sen)."""
     one, other = np.triu_indices(len(passed), 1)
     slope = float(np.median((ahead[other] - ahead[one]) / (passed[other] - passed[one])))
-    jitter_s = _spread(ahead - slope * passed)
+    jitter_s = robust_spread(ahead - slope * passed)
     sigma = jitter_s / (float(np.std(passed)) * np.sqrt(len(passed)))
     if abs(slope) <= max(_SIGNIFICANT * sigma, 1e-7):
-        return 0.0, _spread(ahead)
+        return 0.0, robust_spread(ahead)
     return slope, jitter_s
-
-
-def _spread(values: FloatArray) -> float:
-    return _OF_MEDIAN * float(np.median(np.abs(values - np.median(values))))
 
 
 def _named_instant(scans: Sequence[ScanTimes], sweep_s: float) -> SweepStamp:
