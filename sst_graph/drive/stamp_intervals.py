@@ -16,6 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sst_graph.spread import robust_spread
+
 _LEAST = 15
 """Regular intervals before any is odd."""
 _AFTER = 2
@@ -131,7 +133,7 @@ class FrameIntervals:
         """Period, and the deviation of an interval from it [s]."""
         intervals = np.array(self.intervals)
         period = float(np.median(intervals))
-        return period, max(1.4826 * float(np.median(np.abs(intervals - period))), _LEAST_SIGMA_S)
+        return period, max(robust_spread(intervals), _LEAST_SIGMA_S)
 
     def _jump_of(self, least: float, sigma: float) -> Jump | None:
         """The jump that an odd interval and those behind it make, if any."""

@@ -2,12 +2,14 @@
 
 ``images.csv`` beside ``images/``: one "name,stamp" a line, or "stamp,name" (EuRoC), quotes or none, with
 commas, semicolons, tabs or blanks between; a first line of words is a heading, a line behind "#" a comment.
-Of more columns those of the name and of the stamp are taken, where they show. A file without a line is left
-out, and so is a line whose file is missing. Names may have a path before them, or lack their ending.
+Of more columns those of the name and of the stamp are taken, where they show; empty ones at the end are none.
+A file without a line is left out, and so is a line whose file is missing. Names may have a path before them,
+or lack their ending.
 
 A stamp, here or as a name, is seconds with a decimal point ("1317048145.963.png"), whole nanoseconds
-("1317048145963000000.png"), or seconds and nanoseconds ("1317048145_963000000.png", or two columns).
-Where all of them are dates in whole microseconds or milliseconds they are read as such.
+("1317048145963000000.png"), or seconds and nanoseconds ("1317048145_963000000.png", or two columns of which
+the first is a date); six digits behind a date are microseconds. Where all of them are dates in whole
+microseconds or milliseconds they are read as such.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ from numpy.typing import NDArray
 from sst_graph.data.arrays import listed
 from sst_graph.errors import DataError, count_of
 from sst_graph.files.reading import FileKind, read_text
-from sst_graph.timestamps import MAX_STAMPS, check_rising, checked_ns, parse_seconds
+from sst_graph.timestamps import FAR_APART_S, MAX_STAMPS, check_rising, checked_ns, parse_seconds
 
 STAMPS_CSV = FileKind("a CSV file of name,stamp", 128 * 1024 * 1024)
 LEAST_STEP_NS = 1_000_000
@@ -35,14 +37,17 @@ LEAST_STEP_NS = 1_000_000
 _WHOLE = re.compile(r"[+-]?\d{1,20}", re.ASCII)
 _NUMBER = re.compile(r"[+-]?\d", re.ASCII)
 _SECONDS = re.compile(r"\d{1,12}\.\d+", re.ASCII)
-_PAIR = re.compile(r"(\d{1,10})_(\d{1,9})", re.ASCII)
+_PAIR = re.compile(r"(?=[1-4]\d{9}_|\d+_\d{9}$)(\d{1,10})_(\d{1,9})", re.ASCII)
+"""Seconds and a part of a second: a date, or nanoseconds with all their zeros. Others are counts."""
 _DATE = re.compile(r"\d{9,10}\.\d+|\d{13,19}", re.ASCII)
 """What cannot be a count beside a stamp: a date in seconds, or in whole units of 1 ms to 1 ns."""
-_SECONDS_OF_DATE = re.compile(r"\d{9,10}", re.ASCII)
+_SECONDS_OF_DATE = re.compile(r"[1-4]\d{9}", re.ASCII)
 _DATES_NS = (10**18, 42 * 10**17)
 """The years 2001 to 2103, between which dates of other units than nanoseconds have to lie [ns]."""
 _OTHER_UNITS_NS = (1_000, 1_000_000)
-_STAMP = "seconds with a decimal point, or whole nanoseconds"
+_OF_PART_NS = {9: 1, 6: 1_000}
+"""Unit of the part behind seconds [ns], by the digits of the longest: zeros before the others may lack."""
+_STAMP = "seconds with a decimal point, whole nanoseconds, dates in microseconds or milliseconds, or sec_nsec"
 _LINE = f"name,stamp or stamp,name (or name,sec,nsec); the stamp in {_STAMP}"
 
 
@@ -92,8 +97,7 @@ def stamped_files(folder: Path, suffixes: tuple[str, ...]) -> StampedFiles:
     if len(names) > 1 and float(np.median(np.diff(stamps_ns))) < LEAST_STEP_NS:
         step = float(np.median(np.diff(stamps_ns)))
         found = f"stamps with a median step of {step:g} ns"
-        expected = "stamps in seconds with a decimal point or in whole nanoseconds"
-        raise DataError(table if table.exists() else folder, found, expected)
+        raise DataError(table if table.exists() else folder, found, f"stamps in {_STAMP}")
     paths = tuple(files[name] for name in names)
     return StampedFiles(stamps_ns, paths, len(files) - len(names), without_file)
 
@@ -114,11 +118,18 @@ def _is_stamp(word: str) -> bool:
 def _in_ns(words: Mapping[str, str], places: Mapping[str, str]) -> dict[str, int]:
     """Stamps [ns] by the names of their files, of words that are such.
 
-    Which unit whole numbers have all of them show together.
+    Which unit whole numbers have, or parts behind seconds, all of them show together.
+
+    Raises:
+        DataError: a stamp that no clock shows, or parts of seconds of unknown unit.
     """
-    pairs = [pair for word in words.values() if (pair := _PAIR.fullmatch(word))]
-    padded = all(len(pair[2]) == 9 for pair in pairs)
-    part_ns = 1 if padded or any(int(pair[2]) >= 10**6 for pair in pairs) else 1_000
+    parts = {name: pair[2] for name, word in words.items() if (pair := _PAIR.fullmatch(word))}
+    longest = max(parts, key=lambda name: len(parts[name]), default=None)
+    digits = 9 if longest is None else len(parts[longest])
+    if longest is not None and digits not in _OF_PART_NS:
+        expected = "nanoseconds in 9 digits, or microseconds in 6"
+        raise DataError(places[longest], f"a part of a second in {count_of(digits, 'digit')}", expected)
+    part_ns = _OF_PART_NS[digits]
     whole = [int(word) for word in words.values() if _WHOLE.fullmatch(word)]
     unit_ns = _unit_ns(whole) if len(whole) == len(words) else 1
 
@@ -136,11 +147,10 @@ def _unit_ns(whole: list[int]) -> int:
     """Unit of whole numbers: nanoseconds, or that by which they are dates at a sensor's rate."""
     steps = np.diff(np.unique(np.array(whole, np.float64)))
     step = float(np.median(steps)) if len(steps) else 0.0
-    if step >= LEAST_STEP_NS:
-        return 1
     for unit_ns in _OTHER_UNITS_NS:
         dates = _DATES_NS[0] <= min(whole) * unit_ns <= max(whole) * unit_ns <= _DATES_NS[1]
-        if dates and (len(whole) == 1 or step * unit_ns >= LEAST_STEP_NS):
+        # Nanoseconds since a start some weeks ago would be such dates, too, minutes apart.
+        if dates and (len(whole) == 1 or LEAST_STEP_NS <= step * unit_ns <= FAR_APART_S * 1e9):
             return unit_ns
     return 1
 
@@ -157,7 +167,7 @@ def _table(table: Path, files: Mapping[str, Path]) -> tuple[dict[str, int], int]
     for number, line in enumerate(text.splitlines(), 1):
         words = _words(line)
         place = f"{table}:{number}"
-        if not any(words) or ((number == 1 or line.startswith("#")) and _is_heading(words, known)):
+        if not words or _is_comment(words, known) or (number == 1 and _is_heading(words, known)):
             continue
         entry = _entry(words, known) if len(words) == 2 else _entry_of_many(words, known)
         if entry is None:
@@ -201,8 +211,8 @@ def _entry(words: list[str], known: Mapping[str, str]) -> tuple[str, str] | None
 def _entry_of_many(words: list[str], known: Mapping[str, str]) -> tuple[str, str] | None:
     """Name and stamp of a line of three columns or more, or None where it does not show which they are.
 
-    The name is that of a file, or no number. The stamp is the only date, or seconds and nanoseconds side by
-    side.
+    The name is that of a file, or no number. The stamp is the only date, or the seconds of one and
+    nanoseconds side by side.
     """
     named = [word for word in words if _last_part(word) in known]
     named = [word for word in named if not _WHOLE.fullmatch(word)] or named
@@ -214,7 +224,7 @@ def _entry_of_many(words: list[str], known: Mapping[str, str]) -> tuple[str, str
     pairs = [
         f"{seconds}_{part}"
         for seconds, part in pairwise(others)
-        if _PAIR.fullmatch(f"{seconds}_{part}") and (len(others) == 2 or _SECONDS_OF_DATE.fullmatch(seconds))
+        if _SECONDS_OF_DATE.fullmatch(seconds) and _PAIR.fullmatch(f"{seconds}_{part}")
     ]
     if len(dates) == 1:
         return named[0], dates.pop()
@@ -222,16 +232,25 @@ def _entry_of_many(words: list[str], known: Mapping[str, str]) -> tuple[str, str
 
 
 def _is_heading(words: list[str], known: Mapping[str, str]) -> bool:
-    """Whether a line names neither a file nor a number: "name,stamp_ns", "#timestamp [ns],filename"."""
+    """Whether a line names neither a file nor a number: "name,stamp_ns"."""
     return len(words) > 1 and not any(_last_part(word) in known or _NUMBER.match(word) for word in words)
 
 
+def _is_comment(words: list[str], known: Mapping[str, str]) -> bool:
+    """Whether a line begins with "#", and not with a file that is called so."""
+    return words[0].startswith("#") and _last_part(words[0]) not in known
+
+
 def _words(line: str) -> list[str]:
-    """The fields of a line, quotes removed; a name in quotes may hold commas, and quotes doubled."""
+    """The fields of a line, quotes removed and none empty at the end; a name in quotes may hold commas, and
+    quotes doubled."""
     line = line.strip()
     between = next((mark for mark in ",;\t" if mark in line), " ")
     try:
         rows = csv.reader([line], delimiter=between, skipinitialspace=True, strict=True)
-        return [word.strip() for word in next(rows, [])]
+        words = [word.strip() for word in next(rows, [])]
     except csv.Error:
-        return [line]
+        words = [line]
+    while words and not words[-1]:
+        words.pop()
+    return words

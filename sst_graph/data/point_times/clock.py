@@ -26,6 +26,7 @@ from sst_graph.data.point_times.seconds import (
 )
 from sst_graph.errors import count_of
 from sst_graph.sampling import evenly_spread
+from sst_graph.spread import robust_spread
 from sst_graph.sweep_timing import SweepStamp
 from sst_graph.types import FloatArray
 
@@ -39,10 +40,8 @@ _NEAR_THE_END = 0.1
 """Share of the scans whose first return comes before the start of the sweep that is taken: stamps jitter, and
 the first return is missing in others."""
 _ON_ARRIVAL = 0.7
-"""A message that arrives within this share of a sweep after its stamp has not the stamp of its start."""
+"""Messages that arrive within this share of a sweep after their stamp have not the stamp of its start."""
 _SIGNIFICANT = 3.0
-_OF_MEDIAN = 1.4826
-"""Standard deviation of a normal distribution by its median absolute deviation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +51,7 @@ class ScanTimes:
     Attributes:
         stamp_ns: of the scan.
         values: (n,) in some unit; of points that are used.
-        received_ns: when the recorder got the scan, where that is known.
+        received_ns: when the recorder got the scan, where that is known apart from the stamp.
     """
 
     stamp_ns: int
@@ -115,8 +114,10 @@ def clock_of_points(
     """The clock of a drive's points, where it is another one than that of the stamps, and a sentence on it;
     without a clock, on why it is not known; empty where the times are of the stamps' clock.
 
-    Which instant a stamp names is a convention that no data show for certain: a scan that is received sooner
-    after its stamp than a sweep lasts has the stamp of its end. Otherwise it is that of the start.
+    Single scans do not make it another clock: most have to be far from their stamps.
+
+    Which instant a stamp names is a convention that no data show for certain: where scans are received within
+    0.7 of a sweep after their stamps (median), these are those of the ends. Otherwise they are of the starts.
 
     Args:
         read: times of scan k; None where it has none.
@@ -127,6 +128,10 @@ def clock_of_points(
     if not any(times.are_far() for times in looked_at):
         return None, ""
     scans = [times for k in evenly_spread(range(count), _COMPARED) if (times := read(k)) is not None]
+    telling = sum(not tells_nothing(times.values) for times in scans)
+    scans = [times for times in scans if times.are_far()]
+    if 2 * len(scans) <= telling:
+        return None, ""
     units = Counter(unit for times in scans if (unit := times.unit_ns()))
     unit_ns = max(units, key=lambda unit: units[unit], default=0)
     scans = [times for times in scans if times.unit_ns() == unit_ns]
@@ -171,15 +176,11 @@ def _drift(passed: FloatArray, ahead: FloatArray) -> tuple[float, float]:
     deviation about it [s]; by medians (Theil, Sen)."""
     one, other = np.triu_indices(len(passed), 1)
     slope = float(np.median((ahead[other] - ahead[one]) / (passed[other] - passed[one])))
-    jitter_s = _spread(ahead - slope * passed)
+    jitter_s = robust_spread(ahead - slope * passed)
     sigma = jitter_s / (float(np.std(passed)) * np.sqrt(len(passed)))
     if abs(slope) <= max(_SIGNIFICANT * sigma, 1e-7):
-        return 0.0, _spread(ahead)
+        return 0.0, robust_spread(ahead)
     return slope, jitter_s
-
-
-def _spread(values: FloatArray) -> float:
-    return _OF_MEDIAN * float(np.median(np.abs(values - np.median(values))))
 
 
 def _named_instant(scans: Sequence[ScanTimes], sweep_s: float) -> SweepStamp:
@@ -187,7 +188,7 @@ def _named_instant(scans: Sequence[ScanTimes], sweep_s: float) -> SweepStamp:
     after_s = [
         (times.received_ns - times.stamp_ns) * 1e-9 for times in scans if times.received_ns is not None
     ]
-    return "end" if after_s and 0.0 <= min(after_s) < _ON_ARRIVAL * sweep_s else "start"
+    return "end" if after_s and 0.0 <= float(np.median(after_s)) < _ON_ARRIVAL * sweep_s else "start"
 
 
 def _seconds(ends: NDArray[Any], unit_ns: int) -> float:

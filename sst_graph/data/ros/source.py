@@ -278,7 +278,12 @@ def _clock(
             values = times_of(message, _place(bag, first))
         except DataError:  # which the scan will raise when it is read
             return None
-        return None if values is None else ScanTimes(first.stamp_ns, values, first.message.received_ns)
+        if values is None:
+            return None
+        received_ns = first.message.received_ns
+        # Tools that write bags anew may take the header's stamp for the time of recording, or round it.
+        is_known = options.stamps == "received" or abs(received_ns - first.stamp_ns) > 1_000
+        return ScanTimes(first.stamp_ns, values, received_ns if is_known else None)
 
     return clock_of_points(read, len(index.clouds), options.sweep_stamp)
 

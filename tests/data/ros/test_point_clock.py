@@ -242,3 +242,54 @@ def test_a_drift_is_followed() -> None:
     seconds = seconds_after_stamp(500.0 + 1.00002 * passed[-1] + SWEEP, int(stamps_ns[-1]), found)
     assert seconds is not None
     np.testing.assert_allclose(seconds, SWEEP, atol=1e-5)
+
+
+def test_single_bad_scans_do_not_change_the_clock() -> None:
+    """Whichever of the scans they are: those that are looked at first, too."""
+    stamps_ns = EPOCH_NS + np.arange(20) * 100_000_000
+    by_stamps = [stamp * 1e-9 + SWEEP for stamp in stamps_ns]
+    for bad in ([0], [10], [0, 10, 19]):
+        values = [one + 1e6 * (k in bad) for k, one in enumerate(by_stamps)]
+        assert clock(stamps_ns, values) == (None, "")
+    own = [one + 37.0 if k % 4 else one for k, one in enumerate(by_stamps)]
+    found, _ = clock(stamps_ns, own)
+    assert found is not None
+    assert abs(found.at(EPOCH_NS) - EPOCH_NS - 37 * 10**9) < 1_000_000
+    # Scans without times say nothing of the clock.
+    some = [np.zeros(200) if k % 3 else one + 37.0 for k, one in enumerate(by_stamps)]
+    assert clock(stamps_ns, some)[0] is not None
+
+
+@pytest.mark.parametrize(
+    ("after_s", "named"),
+    [
+        ([0.11] * 20, "start"),
+        ([0.004] * 20, "end"),
+        # Single messages: before their stamp, at once, late.
+        ([-0.01] + [0.11] * 19, "start"),
+        ([0.001] + [0.11] * 19, "start"),
+        ([-0.01] + [0.004] * 19, "end"),
+        ([0.3] * 5 + [0.004] * 15, "end"),
+        ([None] * 19 + [0.11], "start"),
+        # The recorder's clock is behind.
+        ([-0.5] * 20, "start"),
+        ([None] * 20, "start"),
+    ],
+)
+def test_when_messages_arrive_tells_what_their_stamps_name(after_s: list[float | None], named: str) -> None:
+    stamps_ns = (EPOCH_NS + np.arange(20) * 100_000_000).tolist()
+    scans = [
+        ScanTimes(stamp, stamp * 1e-9 + 37.0 + SWEEP, None if after is None else stamp + round(after * 1e9))
+        for stamp, after in zip(stamps_ns, after_s, strict=True)
+    ]
+    assert f"as the {named} of" in clock_of_points(scans.__getitem__, len(scans), "forward")[1]
+
+
+@pytest.mark.parametrize("arrives_s", [0.0, 2e-7], ids=["equal", "rounded"])
+def test_a_bag_rewritten_by_its_stamps_does_not_tell_what_they_name(
+    drive: KittiSource, tmp_path: Path, arrives_s: float
+) -> None:
+    path = bag(drive, tmp_path / "own", Driver(True, arrives_s=arrives_s))
+    assert "a stamp counts as the start of its sweep" in remarks(path)
+    # Times of recording as stamps: the sweep is over by then.
+    assert "a stamp counts as the end of its sweep" in remarks(path, stamps="received")
