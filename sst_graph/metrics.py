@@ -16,6 +16,8 @@ from sst_graph.types import FloatArray, GroundTruth
 
 FORWARD_R_OPTICAL = gtsam.Rot3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
 """Optical camera axes (x right, y down, z forward) turned to vehicle axes (x forward, y left, z up)."""
+LINK_FROM_OPTICAL = gtsam.Pose3(FORWARD_R_OPTICAL, np.zeros(3))
+"""Camera link (x forward, y left, z up) from the optical frame (x right, y down, z forward): REP 103."""
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,11 @@ _OF_MEDIAN = 1.4826
 """Standard deviation of a normal distribution by its median absolute deviation."""
 
 
+def robust_sigma(errors: FloatArray) -> float:
+    """Standard deviation of errors (n,) about zero, by their median size; 0 of none."""
+    return _OF_MEDIAN * float(np.median(np.abs(errors))) if len(errors) else 0.0
+
+
 def robust_spread(values: FloatArray) -> float:
     """Standard deviation of values (n,) about their median, by the median absolute deviation."""
-    return _OF_MEDIAN * float(np.median(np.abs(values - np.median(values))))
+    return robust_sigma(values - np.median(values))

@@ -36,6 +36,7 @@ from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import Drive
 from sst_graph.experiments.markdown import NONE, status_counts, table
 from sst_graph.experiments.starts import error_of, start_near
+from sst_graph.metrics import nees
 from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.types import GroundTruth
 from studies.ablation_cases import CASES, EDGES, JOINT, LEAN, NOTHING, SEARCH, Case, base_of
@@ -241,7 +242,7 @@ class Run:
     @property
     def nees(self) -> float:
         """Normalised error squared, over its dimension."""
-        return float(self.error @ np.linalg.solve(self.covariance, self.error)) / len(self.error)
+        return nees(self.error, self.covariance) / len(self.error)
 
     @property
     def surprise(self) -> float:

@@ -29,7 +29,7 @@ from sst_graph.diagnosis.fit import (
 from sst_graph.diagnosis.poses import start_finding
 from sst_graph.drive.preparation import Drive, ScanFeatures
 from sst_graph.errors import count_of
-from sst_graph.metrics import FORWARD_R_OPTICAL, quaternion_angle_deg
+from sst_graph.metrics import LINK_FROM_OPTICAL, quaternion_angle_deg
 from sst_graph.types import FloatArray, Guess
 
 
@@ -180,7 +180,7 @@ def _starts(guess: gtsam.Pose3 | None) -> Iterator[tuple[str, str, gtsam.Pose3]]
     check = "turn the clouds, or correct the start (Tr)"
     half = np.pi
     yield *INVERTED, guess.inverse()
-    yield *OF_LINK, gtsam.Pose3(FORWARD_R_OPTICAL.inverse(), np.zeros(3)) * guess
+    yield *OF_LINK, LINK_FROM_OPTICAL.inverse() * guess
     yield "the clouds are turned by 180 deg about their z axis", check, _turned(guess, gtsam.Rot3.Rz(half))
     yield "the clouds are upside down", check, _turned(guess, gtsam.Rot3.Rx(half))
     yield (

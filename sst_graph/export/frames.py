@@ -11,7 +11,7 @@ from sst_graph.data.ros.transforms import Transforms
 from sst_graph.errors import ConfigError
 from sst_graph.export.options import CAMERA, NUMBER, ExportOptions
 from sst_graph.export.text import heading
-from sst_graph.imports.rotations import LINK_FROM_OPTICAL
+from sst_graph.metrics import LINK_FROM_OPTICAL
 from sst_graph.result import CalibrationResult
 from sst_graph.rig.result import folder_names
 

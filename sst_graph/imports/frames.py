@@ -14,7 +14,7 @@ from sst_graph.data.ros.transforms import Transforms
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.files.checked_values import checked_time_offset_s
 from sst_graph.files.yaml_file import number
-from sst_graph.imports.rotations import LINK_FROM_OPTICAL
+from sst_graph.metrics import LINK_FROM_OPTICAL
 
 TIME_OFFSET_SENTENCE = (
     "time offset of {frame}: t_lidar = t_camera_stamp + time_offset_s, time_offset_s = {value}"

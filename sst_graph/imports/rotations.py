@@ -1,4 +1,4 @@
-"""Poses in the forms that files have: fixed-axis angles, quaternions, camera link and optical frame."""
+"""Poses in the forms that files have: fixed-axis angles and quaternions."""
 
 from __future__ import annotations
 
@@ -9,11 +9,7 @@ import gtsam
 import numpy as np
 
 from sst_graph.files.checked_values import checked_pose
-from sst_graph.metrics import FORWARD_R_OPTICAL
 from sst_graph.types import FloatArray
-
-LINK_FROM_OPTICAL = gtsam.Pose3(FORWARD_R_OPTICAL, np.zeros(3))
-"""Camera link (x forward, y left, z up) from the optical frame (x right, y down, z forward): REP 103."""
 
 
 def quaternion_xyzw(rotation: gtsam.Rot3) -> FloatArray:

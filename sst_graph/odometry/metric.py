@@ -12,6 +12,7 @@ from sst_graph.factors.motion import skew
 from sst_graph.odometry.depth import RANGE_SIGMA, InverseDepths, inverse_depths
 from sst_graph.odometry.features import Tracks
 from sst_graph.odometry.relative import MIN_NOISE_PX, DirectionMotion, huber_weights, rays
+from sst_graph.spread import robust_sigma
 from sst_graph.types import BoolArray, FloatArray, RelativeMotion
 
 MIN_SCALED_DEPTH = 1e-2
@@ -253,11 +254,6 @@ def _starts(problem: _Problem, motion: DirectionMotion) -> list[gtsam.Pose3]:
     return [
         gtsam.Pose3(aRb, consensus_translation(aRb, fa, fb, rho, noise, RANGE_SIGMA)) for aRb in rotations
     ]
-
-
-def robust_sigma(values: FloatArray) -> float:
-    """Sigma of values about zero by their median size."""
-    return 1.4826 * float(np.median(np.abs(values))) if len(values) else 0.0
 
 
 def _failed(tracks: Tracks, motion: DirectionMotion) -> RelativeMotion:

@@ -11,6 +11,7 @@ import numpy as np
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.factors.motion import cross_rows, skew
 from sst_graph.odometry.features import Tracks
+from sst_graph.spread import robust_sigma
 from sst_graph.types import BoolArray, FloatArray
 
 EPIPOLE_PX = 40.0
@@ -87,7 +88,7 @@ def relative_pose(tracks: Tracks, camera: PinholeCamera) -> DirectionMotion:
 
 def _turn(aRb: FloatArray, left: FloatArray, fb: FloatArray, camera: PinholeCamera) -> DirectionMotion:
     """The rotation alone: the parallax is too small to see a direction."""
-    noise = max(MIN_NOISE_PX, 1.4826 * float(np.median(np.abs(left))))
+    noise = max(MIN_NOISE_PX, robust_sigma(left))
     inliers = np.linalg.norm(left, axis=1) < 4.0 * noise
     covariance = np.diag([1.0] * 3 + [np.pi**2] * 2)
     if np.count_nonzero(inliers) >= _MIN_TRACKS:
@@ -183,7 +184,7 @@ def _refine(
     """Robust Gauss-Newton on r = fa.[t]x aRb.fb / |epipolar line| (in image b, px)."""
     for _ in range(_ITERATIONS):
         residual, J = _line_distance(aRb, direction, fa, fb, camera)
-        noise = max(MIN_NOISE_PX, 1.4826 * float(np.median(np.abs(residual))))
+        noise = max(MIN_NOISE_PX, robust_sigma(residual))
         weighted = huber_weights(residual / noise)[:, None] * J
         normal = weighted.T @ J
         step = -np.linalg.solve(normal + 1e-9 * np.eye(5) * np.trace(normal), weighted.T @ residual)
@@ -192,7 +193,7 @@ def _refine(
         if np.abs(step).max() < 1e-5:
             break
     residual, J = _line_distance(aRb, direction, fa, fb, camera)
-    noise = max(MIN_NOISE_PX, 1.4826 * float(np.median(np.abs(residual))))
+    noise = max(MIN_NOISE_PX, robust_sigma(residual))
     supporters = np.abs(residual) < 4.0 * noise
     variance = noise**2 * _cost_of_weights(residual[supporters] / noise)
     information = J[supporters].T @ J[supporters]
@@ -277,7 +278,7 @@ def _rotation_only(fa: FloatArray, fb: FloatArray, camera: PinholeCamera) -> tup
     aRb = np.eye(3)
     for _ in range(6):
         left = _parallax(aRb, fa, fb, camera)
-        scale = max(0.05, 1.4826 * float(np.median(np.abs(left))))
+        scale = max(0.05, robust_sigma(left))
         weights = np.repeat(huber_weights(np.linalg.norm(left, axis=1) / scale), 2)
         J = _rotation_jacobian(aRb, fa, camera)
         step = np.linalg.lstsq(

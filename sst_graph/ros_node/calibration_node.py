@@ -25,11 +25,12 @@ from sst_graph.data.ros.camera_info import (
 from sst_graph.data.ros.clouds import cloud_of
 from sst_graph.data.ros.frames import CloudReading, check_size, mask_classes, scan_of
 from sst_graph.data.ros.images import picture_of
-from sst_graph.data.ros.link_frame import LEAST_SEEN, LINK_AXES, is_link, of_link_axes, of_optical_axes
+from sst_graph.data.ros.link_frame import LEAST_SEEN, LINK_AXES, is_link
 from sst_graph.data.ros.topics import CLOUD, COMPRESSED, IMAGE, INFO
 from sst_graph.data.ros.transforms import Transforms
 from sst_graph.data.source import TURNS
 from sst_graph.errors import DataError, count_of
+from sst_graph.metrics import LINK_FROM_OPTICAL
 from sst_graph.reference import load_initial
 from sst_graph.ros_node.published import OK, WARN, Diagnosis, NodeMessages, Published, diagnosis_of
 from sst_graph.ros_node.sensor import SensorRecord
@@ -309,7 +310,7 @@ class CalibrationNode:
             return None, 0.0, "no cloud that can be used"
         self._images_in_link = is_link(self.camera.frame, oTl, points, geometry.model)
         if self._images_in_link:
-            oTl = of_optical_axes(oTl)
+            oTl = LINK_FROM_OPTICAL.inverse() * oTl
         if self._T_cloud_lidar is not None:
             oTl = oTl * self._T_cloud_lidar
         return geometry.extrinsic(oTl), 0.0, ""
@@ -434,7 +435,7 @@ class CalibrationNode:
         assert self._geometry is not None
         oTl = gtsam.Pose3(self._geometry.cRo, np.zeros(3)).inverse() * cTl
         if self._images_in_link:
-            oTl = of_link_axes(oTl)
+            oTl = LINK_FROM_OPTICAL * oTl
         if self._T_cloud_lidar is not None:
             oTl = oTl * self._T_cloud_lidar.inverse()  # The frame that the clouds' headers name.
         if self.settings.parent == "lidar":

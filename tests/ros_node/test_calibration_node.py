@@ -26,8 +26,8 @@ from rosbags.highlevel import AnyReader
 import sst_graph.ros_node
 from sst_graph.cli import main
 from sst_graph.data import open_source
-from sst_graph.data.ros.link_frame import of_link_axes, of_optical_axes
 from sst_graph.errors import ConfigError, DataError
+from sst_graph.metrics import LINK_FROM_OPTICAL
 from sst_graph.ros_node import CalibrationNode, NodeSettings, Published
 from sst_graph.ros_node.settings import node_settings, parameter_defaults
 from sst_graph.tracker.config import TrackerConfig
@@ -171,7 +171,7 @@ def test_images_stamped_with_the_camera_s_link(bag: Any, config: TrackerConfig) 
     assert cTl is not None
     for topic, kind, now_ns, message in _messages(bag)[:FEW]:
         if topic == "/tf_static":
-            message = make.transforms({("camera_link", LIDAR_FRAME): of_link_axes(cTl)})
+            message = make.transforms({("camera_link", LIDAR_FRAME): LINK_FROM_OPTICAL * cTl})
         elif topic in (IMAGE, MASK):
             header = dataclasses.replace(message.header, frame_id="camera_link")
             message = dataclasses.replace(message, header=header)
@@ -185,7 +185,7 @@ def test_images_stamped_with_the_camera_s_link(bag: Any, config: TrackerConfig) 
     assert (one.header.frame_id, one.child_frame_id) == ("camera_link", LIDAR_FRAME)
     q, t = one.transform.rotation, one.transform.translation
     linkTl = gtsam.Pose3(gtsam.Rot3.Quaternion(q.w, q.x, q.y, q.z), [t.x, t.y, t.z])
-    np.testing.assert_allclose(of_optical_axes(linkTl).matrix(), found, atol=1e-8)
+    np.testing.assert_allclose((LINK_FROM_OPTICAL.inverse() * linkTl).matrix(), found, atol=1e-8)
     values = {one.key: one.value for one in _diagnostics(node, EPOCH_NS)["camera"].values}
     assert values["axes"].startswith("camera_link shows to be the camera's link (x forward")
 

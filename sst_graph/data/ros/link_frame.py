@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.cameras import CameraModel
-from sst_graph.metrics import FORWARD_R_OPTICAL
+from sst_graph.metrics import LINK_FROM_OPTICAL
 
 LINK_AXES = "x forward, y left, z up"
 _UPWARD = np.cos(np.radians(45.0))
@@ -22,29 +22,28 @@ LEAST_SEEN, _TIMES_MORE = 50, 20.0
 """Fewest points in the image by the axes of a link, and how many times more they are than by optical axes."""
 
 
-def is_link(name: str, oTl: gtsam.Pose3, points: NDArray[np.float32], model: CameraModel) -> bool:
-    """Whether the frame of the images shows to be the camera's link.
+def may_be_link(name: str, oTl: gtsam.Pose3) -> bool:
+    """Whether the frame of the images may be the camera's link, before any cloud is read.
 
     Args:
         name: of the frame; one that says "optical" is believed.
         oTl: pose of the LiDAR in it.
+    """
+    return "optical" not in name.lower() and float(oTl.rotation().matrix()[2, 2]) >= _UPWARD
+
+
+def is_link(name: str, oTl: gtsam.Pose3, points: NDArray[np.float32], model: CameraModel) -> bool:
+    """Whether the frame of the images shows to be the camera's link.
+
+    Args:
+        name, oTl: as of :func:`may_be_link`.
         points: (n, 3) of a scan, frame of the LiDAR [m].
         model: of the camera that took the images.
     """
-    if "optical" in name.lower() or float(oTl.rotation().matrix()[2, 2]) < _UPWARD:
+    if not may_be_link(name, oTl):
         return False
-    by_link = _seen(of_optical_axes(oTl), points, model)
+    by_link = _seen(LINK_FROM_OPTICAL.inverse() * oTl, points, model)
     return by_link >= LEAST_SEEN and by_link > _TIMES_MORE * _seen(oTl, points, model)
-
-
-def of_optical_axes(linkTl: gtsam.Pose3) -> gtsam.Pose3:
-    """Pose of the LiDAR in the optical axes of a camera, from that in its link."""
-    return gtsam.Pose3(FORWARD_R_OPTICAL.inverse(), np.zeros(3)) * linkTl
-
-
-def of_link_axes(oTl: gtsam.Pose3) -> gtsam.Pose3:
-    """The inverse of :func:`of_optical_axes`."""
-    return gtsam.Pose3(FORWARD_R_OPTICAL, np.zeros(3)) * oTl
 
 
 def _seen(cTl: gtsam.Pose3, points: NDArray[np.float32], model: CameraModel) -> int:

@@ -24,13 +24,14 @@ from sst_graph.data.ros.clouds import cloud_of, field_names, times_of
 from sst_graph.data.ros.frames import CloudReading, check_size, mask_classes, scan_of
 from sst_graph.data.ros.images import mask_of, picture_of
 from sst_graph.data.ros.index import BagIndex, Stamped, read_index
-from sst_graph.data.ros.link_frame import LEAST_SEEN, LINK_AXES, is_link, of_optical_axes
+from sst_graph.data.ros.link_frame import LEAST_SEEN, LINK_AXES, is_link, may_be_link
 from sst_graph.data.ros.moving_frame import check_moves_along
 from sst_graph.data.ros.topics import Topics, choose_topics
 from sst_graph.data.source import Loader, SourceOptions
 from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
 from sst_graph.errors import ConfigError, DataError, count_of, printable
 from sst_graph.files.reading import path_of
+from sst_graph.metrics import LINK_FROM_OPTICAL
 from sst_graph.sampling import evenly_spread
 from sst_graph.types import CameraImage, Scan, SemanticClass, Source
 
@@ -235,17 +236,17 @@ def _extrinsic(
 ) -> tuple[gtsam.Pose3 | None, str]:
     """Pose of the LiDAR in the optical axes of the camera by the transforms, or None, and why."""
     oTl, reason = index.transforms.pose(index.image_frame, index.cloud_frame)
-    if oTl is None:
-        return None, reason
     frame = index.image_frame
+    if oTl is None or not may_be_link(frame, oTl):
+        return oTl, reason
     for place in evenly_spread(index.clouds, _CLOUDS_TO_JUDGE):
         message = _read(bag, topics, index, place, topics.cloud.type)
         points = cloud_of(message, place.stamp_ns, _place(bag, place), times=False).points
         # A LiDAR that starts up sends clouds that are all but empty.
         if len(points) >= LEAST_SEEN:
             if is_link(frame, oTl, points, geometry.model):
-                oTl, why = of_optical_axes(oTl), f"{frame!r} shows to be the camera's link ({LINK_AXES})"
-                reason = f"{reason}; {why}"
+                why = f"{frame!r} shows to be the camera's link ({LINK_AXES})"
+                return LINK_FROM_OPTICAL.inverse() * oTl, f"{reason}; {why}"
             break
     return oTl, reason
 

@@ -27,6 +27,7 @@ from sst_graph.odometry.lidar import GROUND_CLASSES, TESTED_CLASSES, LidarOdomet
 from sst_graph.odometry.static_points import on_static_objects
 from sst_graph.points import transformed_by
 from sst_graph.sampling import spread_places
+from sst_graph.spread import robust_sigma
 from sst_graph.sweep_timing import turned
 from sst_graph.types import FloatArray, Scan
 
@@ -293,7 +294,7 @@ class SweepWindow:
         shared = np.add.reduceat(weights * residuals, first) / amount
         around = float((weights * residuals**2).sum() - (amount * shared**2).sum())
         many = amount > _MIN_WEIGHT
-        spread = 1.4826 * float(np.median(np.abs(shared[many]))) if many.any() else 0.0
+        spread = robust_sigma(shared[many])
         total = max(float(amount.sum()), 1e-9)
         return Errors(max(around / total, 1e-12), spread**2)
 
