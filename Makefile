@@ -30,7 +30,7 @@ lint: $(INSTALLED)
 test: lint
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m 'not slow'
 
-# Whole drives, kills, notebooks: what takes more than about five seconds a test.
+# Whole drives, kills, notebooks: what takes more than about three seconds a test.
 test-slow: $(INSTALLED)
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m slow
 

@@ -161,6 +161,7 @@ def test_the_readme_is_short() -> None:
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 120
 
 
+@pytest.mark.slow
 def test_the_program_of_the_figures_draws(tmp_path: Path) -> None:
     program = DOCS / "figures" / "make.py"
     subprocess.run([sys.executable, str(program), "clocks", "--into", str(tmp_path)], cwd=ROOT, check=True)

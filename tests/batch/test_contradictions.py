@@ -300,6 +300,7 @@ def test_motion_that_contradicts_a_stretch_is_left_out() -> None:
     assert "frames 4 to 7" in found.remarks[0]
 
 
+@pytest.mark.slow
 def test_a_stretch_with_an_optimum_that_agrees_contradicts_no_motion() -> None:
     """The same claim; but the scans of the stretch support what the motion says."""
     (drive,) = prepared()

@@ -76,6 +76,7 @@ def traced(frames: int, classes: Sequence[SemanticClass]) -> tuple[int, int, Dri
     return kept, peak, drive
 
 
+@pytest.mark.slow
 def test_little_of_a_frame_stays_in_memory() -> None:
     """Its fields alone take 0.5 MB at half the usual size, its labelled points and mask as much."""
     few, few_peak, _ = traced(6, LABELLED)

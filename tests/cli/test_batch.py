@@ -45,6 +45,7 @@ def test_a_drive_in_the_place_of_a_folder_of_drives_is_told(
     assert "looks like one drive" not in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_folder_of_bags_is_a_folder_of_drives(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Without metadata.yaml; with it, the folder is one bag, and that is said."""
     folder = tmp_path / "day"
@@ -77,6 +78,7 @@ def test_loose_files_are_named_once_and_a_long_reason_is_short_on_the_terminal(
     assert "expected KITTI odometry" in record.reason and len(record.reason) > 300
 
 
+@pytest.mark.slow
 def test_a_batch_in_the_folder_of_its_drives_goes_on(
     drives: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -349,6 +351,7 @@ def test_other_options_do_not_mix(drives: Path, tmp_path: Path, capfd: pytest.Ca
     assert main(["batch", bad, "--out", str(out)]) == 2
 
 
+@pytest.mark.slow
 def test_drives_of_no_known_vehicle_are_named(
     drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -360,6 +363,7 @@ def test_drives_of_no_known_vehicle_are_named(
     assert "note: no vehicle is known of 2 drives: v2_2026-03-01, v2_2026-03-08" in said
 
 
+@pytest.mark.slow
 def test_a_file_of_the_options_is_the_same_to_the_end(
     drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -383,6 +387,7 @@ def test_a_file_of_the_options_is_the_same_to_the_end(
         ("--lidar-model", ".", "data_cfg.yaml"),
     ],
 )
+@pytest.mark.slow
 def test_a_network_of_the_options_is_the_same_to_the_end(
     drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], option: str, named: str, changed: str
 ) -> None:

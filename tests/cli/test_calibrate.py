@@ -129,6 +129,7 @@ def test_a_result_is_a_start(street: Path, tmp_path: Path) -> None:
     assert second.initial_time_offset_s == first.time_offset_s
 
 
+@pytest.mark.slow
 def test_no_guess_at_all(street: Path, tmp_path: Path) -> None:
     assert _calibrate(street, tmp_path / "result", *ONE_FRAME, "--init", "none") == 3
     assert read_result(tmp_path / "result" / "calibration.json").initial is None

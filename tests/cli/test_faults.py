@@ -133,8 +133,9 @@ def test_a_killed_tracker_resumes_to_the_same_bytes(bench: Bench) -> None:
 
 @pytest.mark.parametrize(
     "number",
-    [signal.SIGINT, *(pytest.param(n, marks=pytest.mark.slow) for n in (signal.SIGTERM, signal.SIGHUP))],
+    [signal.SIGINT, signal.SIGTERM, signal.SIGHUP],
 )
+@pytest.mark.slow
 def test_a_signal_leaves_no_unfinished_output(bench: Bench, number: int) -> None:
     _holds(ended_by(bench, COMMANDS["simulate"], number, [0.85]))
 
@@ -174,9 +175,8 @@ def test_a_full_disk_is_named_and_leaves_nothing(bench: Bench, command: str) -> 
     assert row.finished < row.runs  # a small export fits on the small file system
 
 
-@pytest.mark.parametrize(
-    "command", ["simulate", "export", *(pytest.param(name, marks=pytest.mark.slow) for name in ALSO_WRITING)]
-)
+@pytest.mark.parametrize("command", ["simulate", "export", *ALSO_WRITING])
+@pytest.mark.slow
 def test_a_place_that_cannot_be_written_is_refused_before_the_work(bench: Bench, command: str) -> None:
     _holds(read_only(bench, COMMANDS[command]))
 
@@ -216,6 +216,7 @@ def test_closed_streams_do_not_become_files(bench: Bench) -> None:
     assert (desk / "out.yaml").read_bytes() == bench.whole(COMMANDS["export"])[0]["out.yaml"]
 
 
+@pytest.mark.slow
 def test_of_two_writers_one_is_refused(bench: Bench) -> None:
     _holds(two_writers(bench, COMMANDS["simulate"], 1))
 

@@ -146,6 +146,7 @@ def test_another_folder_is_not_replaced(
 
 
 @pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.slow
 def test_plots_of_few_frames(tmp_path: Path, result: CalibrationResult, count: int) -> None:
     frames = frames_of_two_drives(count)
     few = replace(
@@ -159,6 +160,7 @@ def test_plots_of_few_frames(tmp_path: Path, result: CalibrationResult, count: i
     assert shown_in(tmp_path / "plots") == OF_COVARIANCE | expected
 
 
+@pytest.mark.slow
 def test_a_result_of_another_method(
     tmp_path: Path, result: CalibrationResult, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -185,6 +187,7 @@ def test_without_matplotlib(
     assert captured.out == "" and not (tmp_path / "plots").exists()
 
 
+@pytest.mark.slow
 def test_where_matplotlib_does_not_start(tmp_path: Path, result: CalibrationResult) -> None:
     """matplotlib refuses an MPLBACKEND that it does not know when it is imported."""
     program = "import sys; from sst_graph.cli import main; sys.exit(main())"

@@ -222,6 +222,7 @@ def test_drives_of_one_name_are_refused_before_the_work(
     assert "found two drives named street/00" in error and not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_folder_whose_name_is_not_utf8_is_no_obstacle(
     street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -182,6 +182,7 @@ def test_quiet_leaves_results_and_errors(tmp_path: Path, capsys: pytest.CaptureF
     assert "not allowed with" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_calibration_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     street = SimulationConfig(
         seed=4, frames=2, width=276, height=84, azimuth_step_deg=0.5, vehicle_density=0.3, motion="standing"

@@ -74,6 +74,7 @@ def test_bad_settings(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_nothing_is_replaced_without_overwrite(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "drive"
     assert main(["simulate", str(out), "--seed", "1", *SMALL]) == 0
@@ -96,6 +97,7 @@ def test_overwrite_spares_folders_of_others(tmp_path: Path, capsys: pytest.Captu
     assert (tmp_path / "precious").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_a_killed_run_leaves_nothing_under_the_name(tmp_path: Path) -> None:
     out = tmp_path / "drive"
     arguments = ["simulate", str(out), *SMALL, "--set", "frames=150"]
@@ -111,6 +113,7 @@ def test_a_killed_run_leaves_nothing_under_the_name(tmp_path: Path) -> None:
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_leaves_nothing_at_all(tmp_path: Path) -> None:
     arguments = ["simulate", str(tmp_path / "drive"), *SMALL, "--set", "frames=150"]
     process = subprocess.Popen(

@@ -66,6 +66,7 @@ def test_one_line_a_frame(street: Path, tmp_path: Path, capsys: pytest.CaptureFi
     assert "--overwrite" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_parameter_is_estimated(street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "calibration.json"
     main(["track", str(street), *SOON, *AT_ONCE, "--estimate", "focal=0.01", "--out", str(out)])
@@ -243,10 +244,11 @@ def unlabelled(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     "options",
     [
         [],
-        pytest.param(["--method", "auto", *AT_ONCE], marks=pytest.mark.slow),
-        pytest.param(["--method", "edges", *AT_ONCE], marks=pytest.mark.slow),
+        ["--method", "auto", *AT_ONCE],
+        ["--method", "edges", *AT_ONCE],
     ],
 )
+@pytest.mark.slow
 def test_a_drive_without_labels_is_tracked_by_edges(
     unlabelled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str]
 ) -> None:

@@ -141,6 +141,7 @@ DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="no real drives here")
 @pytest.mark.parametrize("name", ["stop", "parked"])
+@pytest.mark.slow
 def test_the_origin_of_a_real_lidar_is_found(name: str) -> None:
     drive = open_source(DATA / f"kitti_2011_09_26_{name}", frames="0:3")
     assert other_axes([_prepared(drive)]) is None

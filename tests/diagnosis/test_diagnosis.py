@@ -124,12 +124,14 @@ def causes(data: KeptDrive, config: CalibrationConfig | None = None) -> list[str
     return [finding.sentence for finding in preflight(drives, Guess(data.nominal, 0.0), CLASSES)]
 
 
-@pytest.mark.parametrize("right", [pytest.param(drive, marks=pytest.mark.slow), other])
+@pytest.mark.parametrize("right", [drive, other])
+@pytest.mark.slow
 def test_right_data_are_left_alone(right: Callable[[], KeptDrive]) -> None:
     assert causes(right()) == []
 
 
 @pytest.mark.parametrize("fault", BY_THEMSELVES)
+@pytest.mark.slow
 def test_a_fault_is_named_before_anything_is_solved(fault: str) -> None:
     # The sweep shows in the stamps; clouds in mm are tried for numbers that are far too large.
     config = CalibrationConfig() if "stamps" in fault or fault == "clouds in mm" else NO_SWEEP

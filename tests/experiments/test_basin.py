@@ -103,6 +103,7 @@ def test_the_command_resumes(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert (tmp_path / "records").read_bytes() == written
 
 
+@pytest.mark.slow
 def test_what_is_done_is_kept_beside_the_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     small = ["--set", "street.frames=2", "--set", "starts=[1]", "--set", "searches_deg=[30]"]
     small += ["--set", "searches_m=[0.6]", "--set", "street.motion=standing", "--out"]

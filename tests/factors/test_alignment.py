@@ -247,6 +247,7 @@ def test_outside_is_positive_and_a_dilated_mask_hides_more_of_it():
     assert silhouette_factor(alignment, E).error(values) == pytest.approx(4.5)
 
 
+@pytest.mark.slow
 def test_silhouette_jacobians_at_100_states(make_scene):
     for seed in range(100):
         alignment, cTl, time_offset_s, twist = make_scene(seed, 4, normals=True, per_point=bool(seed % 2))

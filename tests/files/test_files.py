@@ -452,6 +452,7 @@ def test_a_folder_of_many_files_is_swept(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("rounds", [250, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_a_sweep_leaves_what_another_is_writing(tmp_path: Path, rounds: int) -> None:
     """Also in the instants before a file is locked, and before it has its name."""
     over = threading.Event()

@@ -56,6 +56,7 @@ def _case_of(inputs: Path, bad: str) -> fuzz.Case:
         (f"{IMPORTED}\ne = SstGraphError()\ne.args = ('a\\x1b',)\nraise e", "no printable line"),
     ],
 )
+@pytest.mark.slow
 def test_the_fuzzer_sees_what_is_wrong(tmp_path: Path, bad: str, why: str) -> None:
     case = _case_of(tmp_path, bad)
     assert case.verdict == "FAILURE" and why in case.why, case

@@ -97,6 +97,7 @@ def gentle(t: float) -> gtsam.Pose3:
 
 
 @pytest.mark.parametrize("lidar_noise", [0.2, 1.0])
+@pytest.mark.slow
 def test_noise_of_the_lidar_does_not_draw_the_offset_to_its_stamps(lidar_noise: float) -> None:
     """Between two stamps it is averaged: what that gains is taken off, and no more where it is small."""
     errors = []

@@ -134,6 +134,7 @@ def test_a_pose_far_from_the_guess_is_refused() -> None:
 
 
 @pytest.mark.parametrize("guess", [True, False])
+@pytest.mark.slow
 def test_a_start_from_a_rough_guess_or_none(guess: bool) -> None:
     rough = turned(8.0, -6.0, 9.0) if guess else None
     selection: Selection = run_to_end(select_start_steps(start_problem(rough), JOINT.graph, START))

@@ -88,6 +88,7 @@ def test_visual_speed_of_the_parked_drive() -> None:
 
 @pytest.mark.drives
 @pytest.mark.parametrize("name", [STOP, PARKED])
+@pytest.mark.slow
 def test_lidar_motion(name: str) -> None:
     folder = drive(name)
     source = open_source(DRIVES / name)

@@ -50,6 +50,7 @@ def test_three_tenths_of_a_degree_are_visible(degrees: float) -> None:
     assert profile.unknown == 2 and 1.0 <= -np.sign(degrees) * top(profile) <= 2.0
 
 
+@pytest.mark.slow
 def test_the_score_is_best_at_the_estimate() -> None:
     profiles = fit_by_edges().profiles
     assert [profile.unknown for profile in profiles] == list(range(7))

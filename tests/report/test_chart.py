@@ -156,6 +156,7 @@ def test_matplotlib_is_imported_by_the_first_chart_and_bytes_are_the_same_in_ano
     assert _printed(PYTHONHASHSEED="2", MATPLOTLIBRC=str(settings)) == chart.svg() + "\n"
 
 
+@pytest.mark.slow
 def test_where_matplotlib_does_not_start_the_page_says_why() -> None:
     assert re.match(
         r'<p class="note">Not drawn: matplotlib does not start .*nonsense', _printed(MPLBACKEND="nonsense")

@@ -113,6 +113,7 @@ def _checked(page: str) -> _Checker:
 
 
 @pytest.mark.parametrize("by", PAGES)
+@pytest.mark.slow
 def test_the_page_is_whole_and_in_order(by: str) -> None:
     page = PAGES[by]()
     checker = _checked(page)
@@ -218,6 +219,7 @@ PULLED = (
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium")
+@pytest.mark.slow
 def test_the_picture_says_what_is_shown_on_each_side(tmp_path: Path) -> None:
     page = report_html(ReportInputs(replace(_result(), reasons=("say --sweep",)), [crowded_street()]))
     seen, _ = _opened(tmp_path, page, 1400, False, PULLED)

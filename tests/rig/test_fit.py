@@ -101,6 +101,7 @@ def test_with_nothing_known_the_fit_is_that_of_the_camera_by_itself(name: str) -
 
 
 @pytest.mark.parametrize("name", NAMES)
+@pytest.mark.slow
 def test_the_fit_is_measured_at_the_answer_of_the_rig(name: str) -> None:
     result = together()[name]
     own = result.diagnostics["by_own_images"]

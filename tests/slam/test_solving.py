@@ -114,6 +114,7 @@ def test_the_predicted_sigma_is_that_of_the_pixels(street: Street) -> None:
 
 
 @pytest.mark.parametrize("kind", ["isam2", "smoother"])
+@pytest.mark.slow
 def test_incremental_solvers_come_to_the_truth(street: Street, kind: str) -> None:
     found = street.frame_by_frame(solver_of(kind, 1.25), street.start(1))
     rotation_deg, translation_m, time_offset_s = street.errors(found.values)
@@ -123,6 +124,7 @@ def test_incremental_solvers_come_to_the_truth(street: Street, kind: str) -> Non
     assert found.values.exists(X(0)) == (kind == "isam2")
 
 
+@pytest.mark.slow
 def test_isam2_holds_each_factor_once(street: Street) -> None:
     solver = gtsam.ISAM2(isam2_params())
     street.frame_by_frame(solver, street.start(2))

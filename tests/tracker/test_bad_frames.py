@@ -295,6 +295,7 @@ def test_wider_dtypes_and_other_orders_are_converted(street: SimulatedDrive, fra
 
 
 @pytest.mark.parametrize(("method", "count"), [("joint", 12), ("edges", 5)])
+@pytest.mark.slow
 def test_arrays_may_be_filled_anew(
     street: SimulatedDrive, frames: list[Frame], method: Method, count: int, tmp_path: Path
 ) -> None:

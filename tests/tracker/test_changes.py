@@ -104,6 +104,7 @@ def jumped(folder: Path, frames: list[Frame], jump_ms: int) -> tuple[Tracker, li
 
 
 @pytest.mark.parametrize("jump_ms", [-40, 40])
+@pytest.mark.slow
 def test_a_jump_in_the_first_seconds_raises_the_alarm(
     street: SimulatedDrive, frames: list[Frame], tmp_path: Path, jump_ms: int
 ) -> None:
@@ -116,6 +117,7 @@ def test_a_jump_in_the_first_seconds_raises_the_alarm(
 
 
 @pytest.mark.parametrize("jump_ms", [-30, 30])
+@pytest.mark.slow
 def test_a_smaller_jump_in_the_first_seconds_is_not_silent(
     frames: list[Frame], tmp_path: Path, jump_ms: int
 ) -> None:
@@ -127,6 +129,7 @@ def test_a_smaller_jump_in_the_first_seconds_is_not_silent(
 @pytest.mark.parametrize(
     ("sensor", "jump_ms"), [("image", -30), ("image", 30), ("scan", 30), ("image", -200)]
 )
+@pytest.mark.slow
 def test_stamps_that_jump_against_their_interval_are_an_alarm(
     frames: list[Frame], tmp_path: Path, sensor: str, jump_ms: int
 ) -> None:
@@ -249,6 +252,7 @@ def _largest(frame: Frame, street: SimulatedDrive) -> int:
     return int(np.bincount(scan.instances[in_view]).argmax())
 
 
+@pytest.mark.slow
 def test_what_one_object_alone_contradicts_is_suspected(street: SimulatedDrive, frames: list[Frame]) -> None:
     """One car is in view, and its labels are off: no alarm, but it is reported, and the estimate from before
     is kept as the reference."""
@@ -274,6 +278,7 @@ def _sure_tracker(street: SimulatedDrive) -> Tracker:
     return tracker_from_truth(street, dataclasses.replace(EARLY_START, calibration=calibration))
 
 
+@pytest.mark.slow
 def test_no_estimate_is_ok_while_the_latest_frames_contradict_it(
     street: SimulatedDrive, frames: list[Frame]
 ) -> None:
@@ -295,6 +300,7 @@ def test_no_estimate_is_ok_while_the_latest_frames_contradict_it(
     assert before and before[0] >= STEP and alone
 
 
+@pytest.mark.slow
 def test_a_knock_that_no_frame_can_show_is_not_ok(
     street: SimulatedDrive, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -346,6 +352,7 @@ def test_frames_that_show_nothing_let_the_estimate_age(
     assert status[-1] == "ok" and update.unconfirmed_s == 0.0
 
 
+@pytest.mark.slow
 def test_frames_confirm_together_what_four_do_not_show(street: SimulatedDrive, frames: list[Frame]) -> None:
     """A threshold that a turn by 0.25 degrees passes in the latest 20 scans, but not in four."""
     config = dataclasses.replace(EARLY_START, alarm=AlarmConfig(chi2=130.0))
@@ -360,6 +367,7 @@ def test_frames_confirm_together_what_four_do_not_show(street: SimulatedDrive, f
 
 
 @pytest.mark.parametrize("missing", ["empty", "none"])
+@pytest.mark.slow
 def test_without_scans_the_estimate_ages(street: SimulatedDrive, frames: list[Frame], missing: str) -> None:
     """The LiDAR delivers empty scans for a while, or none: nothing changes, but time passes."""
     tracker, status = _sure_tracker(street), []
@@ -376,6 +384,7 @@ def test_without_scans_the_estimate_ages(street: SimulatedDrive, frames: list[Fr
     assert status[STEP + 11] == "unconfirmed"
 
 
+@pytest.mark.slow
 def test_a_suspected_change_that_is_given_up_is_no_confirmation(
     street: SimulatedDrive, frames: list[Frame]
 ) -> None:

@@ -97,6 +97,7 @@ def test_a_save_is_written_with_the_frames_that_follow(
     assert Tracker.load(path).inputs.window.next_scan == 3 and list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.slow
 def test_what_is_saved_does_not_depend_on_when_it_was_stored(tmp_path: Path) -> None:
     """The same tracker, whether much or nothing was stored with earlier frames."""
     street, paths = simulate(SMALL), [tmp_path / name for name in ("followed", "at_once")]

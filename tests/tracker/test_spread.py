@@ -67,6 +67,7 @@ def test_stored_and_rolled_back_on_the_way(
     assert sigmas_apart(kept, other.estimate.point.cTl, other.estimate.point.time_offset_s) < 1e-5
 
 
+@pytest.mark.slow
 def test_a_drive_that_ends_before_the_start_is_done(street: SimulatedDrive, frames: list[Frame]) -> None:
     """Solving the window brings it to its end, and the answer is as if it had begun in time."""
     slow = spread_over(street, 1)
@@ -79,6 +80,7 @@ def test_a_drive_that_ends_before_the_start_is_done(street: SimulatedDrive, fram
     assert sigmas_apart(slow, street.truth.cTl, street.truth.time_offset_s or 0.0) < 5.0
 
 
+@pytest.mark.slow
 def test_each_step_of_a_start_is_small(street: SimulatedDrive, frames: list[Frame]) -> None:
     """With the search, too: the declared cost of a step, and that there are many."""
     tracker = Tracker(street.camera, initial=street.nominal)
@@ -89,6 +91,7 @@ def test_each_step_of_a_start_is_small(street: SimulatedDrive, frames: list[Fram
     assert max(steps) <= 12 and len(steps) > 100
 
 
+@pytest.mark.slow
 def test_the_graph_of_a_start_is_made_some_scans_a_frame(street: SimulatedDrive, frames: list[Frame]) -> None:
     """No frame matches all scans of the start, and what a save in between holds is the same."""
     tracker, most, seen = spread_over(street, 6), 0, set()

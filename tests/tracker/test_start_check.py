@@ -33,7 +33,8 @@ def updates_of(
     return tracker, updates
 
 
-@pytest.mark.parametrize("step", [pytest.param(4, marks=pytest.mark.slow), 11])
+@pytest.mark.parametrize("step", [4, 11])
+@pytest.mark.slow
 def test_a_knock_during_or_after_a_start_is_not_averaged(
     street: SimulatedDrive, frames: list[Frame], step: int
 ) -> None:

@@ -42,6 +42,7 @@ def _residual_px(views: list[FrameView]) -> float:
     return float(np.median(np.concatenate([np.abs(v.matches.residuals_px) for v in views if v.matches])))
 
 
+@pytest.mark.slow
 def test_a_drive_under_its_calibration(street: SimulatedDrive, frames: list[Frame], tmp_path: Path) -> None:
     cTl, time_offset_s = _truth(street)
     views = list(views_under(frames[:COUNT], street.camera, cTl, time_offset_s, CAR))

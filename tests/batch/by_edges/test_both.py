@@ -308,6 +308,7 @@ def fused() -> tuple[MethodEstimate, Guess]:
     return fuse_parts(*found), guess
 
 
+@pytest.mark.slow
 def test_labels_and_edges_are_measured_apart_at_the_estimate_of_both() -> None:
     both, _ = fused()
     labels, edges = both.fit, both.edges_fit

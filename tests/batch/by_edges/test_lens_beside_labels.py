@@ -74,6 +74,7 @@ def all_half_samples(right_px: float) -> tuple[dict[str, ParameterTest], int]:
     return stored((STREET, "lens beside labels", right_px), lambda: counted(right_px))
 
 
+@pytest.mark.slow
 def test_the_right_principal_point_is_not_contradicted() -> None:
     tests, _ = all_half_samples(0.0)
     assert set(tests) == {"cx", "cy"}
@@ -82,6 +83,7 @@ def test_the_right_principal_point_is_not_contradicted() -> None:
 
 
 @pytest.mark.parametrize("right_px", [8.0, -8.0])
+@pytest.mark.slow
 def test_a_wrong_one_is_found(right_px: float) -> None:
     cx = all_half_samples(right_px)[0]["cx"]
     assert cx.contradicted and cx.value == pytest.approx(right_px, abs=2.5)

@@ -109,6 +109,7 @@ def test_of_unlabelled_pictures_and_scans_nothing_is_measured() -> None:
     assert measured_lines(measured) == ["no boundary point has a contour or an edge of the picture nearby"]
 
 
+@pytest.mark.slow
 def test_the_settings_are_those_of_the_result(caplog: pytest.LogCaptureFixture) -> None:
     result = _true_result()
     chosen = {"classes": ["pole"], "max_range_m": 30.0}

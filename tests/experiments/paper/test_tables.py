@@ -36,6 +36,7 @@ def rows_of(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(stream))
 
 
+@pytest.mark.slow
 def test_a_kitti_root_gives_the_stretch_of_sequence_00(
     kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -174,6 +175,7 @@ def test_a_kill_costs_the_runs_under_way(kitti: Path, tmp_path: Path) -> None:
     assert lines(state) == 601
 
 
+@pytest.mark.slow
 def test_bad_frames_in_a_process_are_one_line(
     kitti: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 from stored import simulated
 
 from sst_graph.batch import CalibrationConfig, prepare_drives
@@ -30,6 +31,7 @@ STREET = SimulationConfig(
 )
 
 
+@pytest.mark.slow
 def test_points_stand_where_the_image_sees_them() -> None:
     """Labelled points fall on their class with the truth, clearly fewer without the motion of 43 cm."""
     source = simulated(STREET)

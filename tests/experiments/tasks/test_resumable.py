@@ -123,11 +123,13 @@ def test_what_was_done_before_an_error_is_kept(tmp_path: Path) -> None:
     assert RUNS == [5, -1]
 
 
+@pytest.mark.slow
 def test_processes_give_the_same_rows_in_the_order_of_the_tasks(tmp_path: Path) -> None:
     groups = [[Task(0), Task(1)], [Task(2)], [Task(3)]]
     assert rows_of(work(tmp_path / "records", jobs=2), groups) == rows_of(Work(squared, Row), groups)
 
 
+@pytest.mark.slow
 def test_errors_of_processes(tmp_path: Path) -> None:
     path = tmp_path / "records"
     with pytest.raises(DataError, match="a drive: found nothing"):
