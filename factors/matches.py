@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -204,6 +205,25 @@ def _taken(rows: FloatArray, index: slice | NDArray[np.intp]) -> FloatArray:
     return taken
 
 
+def joined(alignments: Sequence[Alignment], c_acceleration: FloatArray | None = None) -> Alignment:
+    """Matches of some images of one camera as one alignment, each with the acceleration (6,) of its image, or
+    all with the one given."""
+    counts = [len(each) for each in alignments]
+    if c_acceleration is None:
+        c_acceleration = np.repeat([each.c_acceleration for each in alignments], counts, axis=0)
+    rows: dict[str, Any] = {"c_acceleration": c_acceleration}
+    for name in _OF_EACH_MATCH:
+        own = [getattr(each, name) for each in alignments]
+        if any(each is not None for each in own):
+            # Objects without a velocity stand, and images that were not rectified are not stretched.
+            usual = np.zeros(3) if name == "l_velocities" else np.ones(())
+            parts = zip(own, counts, strict=True)
+            rows[name] = np.concatenate(
+                [np.full((n, *usual.shape), usual) if each is None else each for each, n in parts]
+            )
+    return replace(alignments[0], **rows)
+
+
 def joined_points(alignments: Sequence[Alignment]) -> Sequence[Alignment]:
     """Point-to-pixel matches of one image as one alignment, where they differ in nothing but their matches:
     with the few thousand of a frame, the calls for a second one would cost as much as its work."""
@@ -217,13 +237,4 @@ def joined_points(alignments: Sequence[Alignment]) -> Sequence[Alignment]:
     )
     if len(alignments) == 1 or not alike:
         return alignments
-    return [
-        replace(
-            first,
-            lPs=np.concatenate([each.lPs for each in alignments]),
-            base_taus_s=np.concatenate([each.base_taus_s for each in alignments]),
-            pixels=np.concatenate([each.pixels for each in alignments]),
-            sigmas_px=np.concatenate([each.sigmas_px for each in alignments]),
-            weights=np.concatenate([each.weights for each in alignments]),
-        )
-    ]
+    return [joined(alignments, first.c_acceleration)]

@@ -1,27 +1,22 @@
 """What each heuristic is worth: the method without one of them, against the full method on the same data.
 
-    OMP_NUM_THREADS=1 python -m studies.ablation run --out RUNS.jsonl --streets first:2 --drive stop=DIR
-    python -m studies.ablation table RUNS.jsonl --into docs/results/ablation.md
+    OMP_NUM_THREADS=1 python -m studies.ablation --records RUNS.jsonl --streets first:2 --drive stop=DIR
 
 ``studies/ablation_cases.py`` has the cases. A street is 24 frames of 621 x 188 px of one of three simulators,
-``first`` is the package's own; images of drives in folders are shifted by one. ``run`` appends a line a run
-to its file, skips those that the file has, and prints the tables. By labels, starts are 1 deg, 5 cm and 20 ms
-from the truth; by edges, and with ``--method search``, within 4 and 12 deg and 10 cm by axis, without an
-offset. ``table`` writes the tables into the blocks of a page whose command is a ``run`` of that method.
+``first`` is the package's own; images of drives in folders are shifted by one. By labels, starts are 1 deg,
+5 cm and 20 ms from the truth; by edges, and with ``--method search``, within 4 and 12 deg and 10 cm by axis,
+without an offset. What is done stands in the file of records; a further call goes on from it and prints the
+tables.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import os
-import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -36,16 +31,13 @@ from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import Drive
 from sst_graph.experiments.markdown import NONE, status_counts, table
 from sst_graph.experiments.starts import error_of, start_near
+from sst_graph.experiments.tasks.resumable import Work, rows_of
 from sst_graph.metrics import nees
 from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.types import GroundTruth
 from studies.ablation_cases import CASES, EDGES, JOINT, LEAN, NOTHING, SEARCH, Case, base_of
 from studies.simulators.second_street import SecondStreet, StreetConfig
 from studies.simulators.third_street import ThirdConfig, ThirdStreet
-
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT / "docs"))
-import make_tables  # noqa: E402 (a program beside the pages)
 
 FloatArray = NDArray[np.float64]
 
@@ -135,6 +127,45 @@ def config_of(method: str) -> CalibrationConfig:
     return replace(with_overrides(CalibrationConfig(), words), for_report=False)
 
 
+@dataclass(frozen=True)
+class Task:
+    """A run: what is calibrated, how, and the name of the case."""
+
+    data: Data
+    method: str
+    case: str
+
+
+@dataclass(frozen=True)
+class Record:
+    """A run that is done.
+
+    Attributes:
+        method, data, case: names of its task.
+        failed: why there is no result; empty where there is.
+        error, covariance: of extrinsic and time offset.
+        status, reasons: of the result.
+        seconds: of the CPU.
+    """
+
+    method: str
+    data: str
+    case: str
+    failed: str = ""
+    error: Sequence[float] = ()
+    covariance: Sequence[Sequence[float]] = ()
+    status: str = ""
+    reasons: Sequence[str] = ()
+    seconds: float = 0.0
+
+
+def records_of(tasks: Sequence[Task]) -> Iterator[list[Record]]:
+    """The runs of one method on one drive."""
+    runner = Runner(tasks[0].data, tasks[0].method)
+    for task in tasks:
+        yield [runner.record(next(case for case in CASES if case.name == task.case))]
+
+
 class Runner:
     """Runs cases on one drive, which is prepared once for those that leave the preparation as it is."""
 
@@ -142,13 +173,13 @@ class Runner:
         self._data, self._method = data, method
         self._prepared: tuple[list[Drive], float] | None = None
 
-    def record(self, case: Case) -> dict[str, Any]:
-        """One calibration, JSON-able; what fails says why."""
-        found = {"method": self._method, "data": self._data.name, "case": case.name}
+    def record(self, case: Case) -> Record:
+        """One calibration; what fails says why."""
+        found = Record(self._method, self._data.name, case.name)
         try:
-            return found | self._calibrated(case)
+            return replace(found, **self._calibrated(case))
         except Exception as error:  # a case may well break the method: that is a finding, too
-            return found | {"failed": f"{type(error).__name__}: {error}"[:_LONGEST_REASON]}
+            return replace(found, failed=f"{type(error).__name__}: {error}"[:_LONGEST_REASON])
 
     def _calibrated(self, case: Case) -> dict[str, Any]:
         data, config = self._data, case.configured(config_of(self._method))
@@ -179,32 +210,6 @@ class Runner:
         return found
 
 
-def read_records(path: Path) -> list[dict[str, Any]]:
-    """Runs that a file has; none of a line that a kill has cut off."""
-    if not path.exists():
-        return []
-    whole, _, _ = path.read_text(encoding="utf-8").rpartition("\n")
-    return [json.loads(line) for line in whole.splitlines()]
-
-
-def run(path: Path, drives: Sequence[Data], cases: Sequence[Case], method: str) -> None:
-    """Append the runs that a file does not have."""
-    if path.exists():
-        os.truncate(path, path.read_bytes().rfind(b"\n") + 1)
-    known = {(one["method"], one["data"], one["case"]) for one in read_records(path)}
-    commit = _git("rev-parse", "--short", "HEAD")
-    for data in drives:
-        missing = [case for case in cases if (method, data.name, case.name) not in known]
-        if not missing:
-            continue
-        runner = Runner(data, method)
-        for case in missing:
-            record = runner.record(case) | {"commit": commit}
-            with path.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(record) + "\n")
-            print(method, data.name, case.name, record.get("status", record.get("failed")), file=sys.stderr)
-
-
 @dataclass(frozen=True)
 class Run:
     """What a run found.
@@ -223,15 +228,15 @@ class Run:
     seconds: float
 
     @classmethod
-    def of(cls, record: dict[str, Any]) -> Run:
+    def of(cls, record: Record) -> Run:
         """From a record."""
-        kind = record["data"].partition("-")[0]
-        error, covariance = np.array(record["error"]), np.array(record["covariance"])
+        kind = record.data.partition("-")[0]
+        error, covariance = np.array(record.error), np.array(record.covariance)
         if kind in ONE_SPEED_MPS:
             seen = np.eye(6, 7)
             seen[3, 6] = -ONE_SPEED_MPS[kind]
             error, covariance = seen @ error, seen @ covariance @ seen.T
-        return cls(kind, error, covariance, record["status"], record["seconds"])
+        return cls(kind, error, covariance, record.status, record.seconds)
 
     @property
     def sizes(self) -> list[float]:
@@ -368,24 +373,23 @@ def _ratio_cell(ratios: FloatArray) -> str:
     return f"{ratio:.2f} ± {ratio * ratios.std(ddof=1) / np.sqrt(len(ratios)):.2f}"
 
 
-def comparisons(records: Sequence[dict[str, Any]], method: str) -> list[Comparison]:
+def comparisons(records: Sequence[Record], method: str) -> list[Comparison]:
     """Every case that was run by a method, against the full method; those with the most lines first."""
-    own = {(one["case"], one["data"]): one for one in records if one["method"] == method}
+    own = {(one.case, one.data): one for one in records}
     found = []
     for case in CASES[1:]:
         base = base_of(case, method).name
-        full = {data: Run.of(one) for (name, data), one in own.items() if name == base and "error" in one}
+        full = {data: Run.of(one) for (name, data), one in own.items() if name == base and not one.failed}
         made = {data: one for (name, data), one in own.items() if name == case.name and data in full}
-        pairs = [(full[data], Run.of(one)) for data, one in made.items() if "error" in one]
+        pairs = [(full[data], Run.of(one)) for data, one in made.items() if not one.failed]
         if pairs:
             found.append(Comparison(case, pairs, len(made) - len(pairs)))
     return sorted(found, key=lambda one: -one.case.size)
 
 
-def tables(records: Sequence[dict[str, Any]], method: str) -> str:
-    """The full method's table, and a row for each heuristic left out."""
-    own = [one for one in records if one["method"] == method and "error" in one]
-    full = [Run.of(one) for one in own if one["case"] == NOTHING.name]
+def tables(records: Sequence[Record], method: str) -> str:
+    """The full method's table, and a row for each heuristic left out, by the runs of one method."""
+    full = [Run.of(one) for one in records if one.case == NOTHING.name and not one.failed]
     present = dict.fromkeys(one.kind for one in full)
     kinds = [kind for kind in SIMULATORS if kind in present]
     kinds += sorted(kind for kind in present if kind not in SIMULATORS)
@@ -418,48 +422,6 @@ def _full_cells(kind: str, runs: Sequence[Run]) -> list[str]:
     ]
 
 
-def commit_of(records: Sequence[dict[str, Any]]) -> str:
-    """The newest commit of some runs.
-
-    Raises:
-        SystemExit: the package was another one in an older one.
-    """
-    *older, newest = dict.fromkeys(one["commit"] for one in records)
-    for commit in older:
-        if _git("diff", "--name-only", commit, newest, "--", "sst_graph", "factors"):
-            raise SystemExit(f"found runs of {commit} and {newest}, expected those of one package")
-    return str(newest)
-
-
-def write_into(page: Path, records: Sequence[dict[str, Any]]) -> None:
-    """Write tables into those blocks of a page whose command runs this program."""
-    text = page.read_text(encoding="utf-8")
-    for block in make_tables.tables_of(page):
-        _, found, words = block.command.partition("studies.ablation ")
-        if found:
-            args = parsed(words.split())
-            own = chosen(records, args)
-            body = make_tables.body(block.command, tables(own, args.method), commit_of(own))
-            text = make_tables.replaced(text, block.command, body)
-    page.write_text(text, encoding="utf-8")
-
-
-def chosen(records: Sequence[dict[str, Any]], args: argparse.Namespace) -> list[dict[str, Any]]:
-    """The runs that a ``run`` of these arguments makes."""
-    names = {data.name for data in data_of(args.streets, args.drive, args.frames)}
-    cases = {case.name for case in cases_of(args.cases, args.method)}
-    return [
-        one
-        for one in records
-        if one["method"] == args.method and one["data"] in names and one["case"] in cases
-    ]
-
-
-def _git(*words: str) -> str:
-    done = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True)
-    return done.stdout.strip()
-
-
 def data_of(streets: str, folders: Sequence[str], frames: int) -> Iterator[Data]:
     """Drives in folders, ``NAME=DIR``; then streets, ``first:2,third:1``, of each simulator in turn."""
     for each in folders:
@@ -486,34 +448,26 @@ def cases_of(names: str, method: str) -> list[Case]:
     return [case for case in own if case.name in chosen]
 
 
-def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Arguments of ``run`` or ``table``."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    commands = parser.add_subparsers(dest="command", required=True)
-    runner = commands.add_parser("run")
-    runner.add_argument("--out", required=True, type=Path, help="file of a line a run")
-    runner.add_argument("--method", choices=METHODS, default=JOINT)
-    runner.add_argument("--streets", default="", help="how many of each simulator: first:2,second:2,third:2")
-    runner.add_argument("--drive", action="append", default=[], metavar="NAME=DIR")
-    runner.add_argument("--cases", default="", help="names, with commas between them; all without")
-    runner.add_argument("--frames", type=int, default=FRAMES, help="of a street")
-    writer = commands.add_parser("table")
-    writer.add_argument("runs", type=Path)
-    writer.add_argument("--into", required=True, type=Path)
-    return parser.parse_args(arguments)
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
-    """``run`` or ``table``."""
-    args = parsed(arguments)
-    if args.command == "table":
-        write_into(args.into, read_records(args.runs))
-        return
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--records", required=True, help="file of the runs")
+    parser.add_argument("--method", choices=METHODS, default=JOINT)
+    parser.add_argument("--streets", default="", help="how many of each simulator: first:2,second:2,third:2")
+    parser.add_argument("--drive", action="append", default=[], metavar="NAME=DIR")
+    parser.add_argument("--cases", default="", help="names, with commas between them; all without")
+    parser.add_argument("--frames", type=int, default=FRAMES, help="of a street")
+    args = parser.parse_args(arguments)
     cv2.setNumThreads(1)
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    drives, cases = list(data_of(args.streets, args.drive, args.frames)), cases_of(args.cases, args.method)
-    run(args.out, drives, cases, args.method)
-    print(tables(chosen(read_records(args.out), args), args.method))
+    cases = cases_of(args.cases, args.method)
+    groups = [
+        [Task(data, args.method, case.name) for case in cases]
+        for data in data_of(args.streets, args.drive, args.frames)
+    ]
+
+    def progress(what: str, done: int, count: int) -> None:
+        print(f"{what}: {done} of {count}", file=sys.stderr)
+
+    print(tables(rows_of(Work(records_of, Record, records=args.records), groups, progress), args.method))
 
 
 if __name__ == "__main__":

@@ -30,6 +30,7 @@ from sst_graph import (
     solve_with_terms,
 )
 from sst_graph.drive.preparation import Drive, PrepareConfig, prepare_drive
+from sst_graph.metrics import nees
 from sst_graph.objects.tracks import scan_poses
 
 FloatArray = NDArray[np.float64]
@@ -140,10 +141,9 @@ def main() -> None:
         values, covariance, converged, warnings = solved(problem, arguments.solver)
         late = values.atVector(D(0))[0] - truth.time_offset_s
         error = np.append(truth.cTl.localCoordinates(values.atPose3(E(0))), late)
-        nees = float(error @ np.linalg.solve(covariance, error)) / 7.0
         sizes = np.linalg.norm(error[:3]) * UNITS[0], np.linalg.norm(error[3:6]) * UNITS[3]
         print(f"start {seed}: {sizes[0]:.2f} deg, {sizes[1]:.1f} cm, {error[6] * UNITS[6]:+.1f} ms, ", end="")
-        print(f"NEES/7 {nees:.2f}{'' if converged else ', not converged'}")
+        print(f"NEES/7 {nees(error, covariance) / 7.0:.2f}{'' if converged else ', not converged'}")
         print(f"  errors {np.round(error * UNITS, 2)}")
         print(f"  sigmas {np.round(np.sqrt(np.diag(covariance)) * UNITS, 2)}", flush=True)
         for warning in warnings:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from sst_graph import CalibrationConfig, calibrate, open_source
 from sst_graph.experiments.markdown import lines, table
 from sst_graph.experiments.starts import error_of
+from sst_graph.metrics import nees
 from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.types import Source
 from studies.simulators.third_street import ThirdConfig, ThirdStreet
@@ -82,11 +83,6 @@ def sigma_cells(covariance: FloatArray) -> tuple[str, str, str]:
     return rotation.replace("+", ""), translation.replace("+", ""), offset.replace("+", "")
 
 
-def nees_of(error: FloatArray, covariance: FloatArray) -> float:
-    """Squared error over the covariance, over its dimension of seven."""
-    return float(error @ np.linalg.solve(covariance, error)) / 7.0
-
-
 def short(name: str) -> str:
     """A street's name, or the last part of a drive's folder."""
     return f"`{Path(name).name}`"
@@ -104,12 +100,12 @@ def rows(
         result = calibrate(source, start, CalibrationConfig(method="edges"))
         seconds = time.process_time() - began
         error = error_of(result.calibration, truth)
-        nees = nees_of(error, result.covariance)
-        found.append((error * UNITS, nees))
+        share = nees(error, result.covariance) / 7.0
+        found.append((error * UNITS, share))
         for reason in result.reasons:
             print(f"{name}: {reason}", file=sys.stderr, flush=True)
         sigmas = sigma_cells(result.covariance)
-        yield short(name), *cells(error), *sigmas, f"{nees:.1f}", result.status, f"{seconds:.0f}"
+        yield short(name), *cells(error), *sigmas, f"{share:.1f}", result.status, f"{seconds:.0f}"
 
 
 def main() -> None:
@@ -120,13 +116,13 @@ def main() -> None:
     found: list[tuple[FloatArray, float]] = []
     for line in lines(HEAD, rows(args.names, not args.no_guess, found)):
         print(line, flush=True)
-    errors, nees = np.array([error for error, _ in found]), np.array([each for _, each in found])
+    errors, shares = np.array([error for error, _ in found]), np.array([each for _, each in found])
     rotation, shift = np.linalg.norm(errors[:, :3], axis=1), np.abs(errors[:, 3:6]).mean(axis=1)
     of_all = (
         ("rotation [deg]", rotation),
         ("ATD [cm]", shift),
         ("time offset [ms]", np.abs(errors[:, 6])),
-        ("NEES / 7", nees),
+        ("NEES / 7", shares),
     )
     summary = [
         (what, *(f"{value:.2f}" for value in (np.median(each), each.mean(), each.max())))

@@ -20,16 +20,14 @@ from dataclasses import replace
 import cv2
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.batch import calibrate_prepared, prepare_drives
 from sst_graph.errors import ContradictionError
 from sst_graph.experiments.markdown import NONE, table
 from sst_graph.export import CalibrationMarginal, Common, fuse_marginals, marginal_of_result
+from sst_graph.metrics import nees
 from sst_graph.types import Calibration
 from studies.small_streets import CONFIG, FIRST_SEED, drawn, street
-
-FloatArray = NDArray[np.float64]
 
 _REFERENCE = gtsam.Pose3()
 """What all streets' extrinsics are moved to, so that one vehicle has one."""
@@ -47,10 +45,10 @@ def marginal_of(seed: int, vehicle: int) -> CalibrationMarginal | None:
     return replace(marginal_of_result(result), cTl=_REFERENCE.retract(off), time_offset_s=offset_s)
 
 
-def nees(marginal: CalibrationMarginal) -> float:
-    """Squared error over its covariance, over its dimension."""
+def nees_of(marginal: CalibrationMarginal) -> float:
+    """NEES over its dimension."""
     error = Calibration(_REFERENCE).local_coordinates(marginal.best())
-    return float(error @ np.linalg.solve(marginal.covariance(), error)) / len(error)
+    return nees(error, marginal.covariance()) / len(error)
 
 
 def outcome(parts: Sequence[CalibrationMarginal]) -> tuple[float, bool]:
@@ -60,7 +58,7 @@ def outcome(parts: Sequence[CalibrationMarginal]) -> tuple[float, bool]:
         refused = False
     except ContradictionError:
         refused = True
-    return nees(fuse_marginals(parts, significance=0.0)), refused
+    return nees_of(fuse_marginals(parts, significance=0.0)), refused
 
 
 def main() -> None:
@@ -78,7 +76,7 @@ def main() -> None:
         if len(parts) < 2:
             continue
         used += len(parts)
-        single += [nees(part) for part in parts]
+        single += [nees_of(part) for part in parts]
         together.append(outcome(parts))
         apart.append(outcome([replace(part, common=Common()) for part in parts]))
         print(f"vehicle {vehicle}: {together[-1]} {apart[-1]}", file=sys.stderr, flush=True)

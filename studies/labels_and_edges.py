@@ -24,12 +24,12 @@ from sst_graph.batch.method_estimate import MethodEstimate
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.experiments.markdown import lines
 from sst_graph.experiments.starts import error_of
+from sst_graph.metrics import nees
 from sst_graph.result import CalibrationResult
 from sst_graph.types import Calibration, Frame, SemanticClass
 from studies.edges_streets import (
     FloatArray,
     cells,
-    nees_of,
     short,
     sigma_cells,
     source_of,
@@ -58,7 +58,7 @@ def row(name: str, by: str, error: FloatArray, covariance: FloatArray, more: str
     degrees, shift = np.degrees(np.linalg.norm(error[:3])), 100.0 * np.abs(error[3:6]).mean()
     sizes = f"{degrees:.2f} deg, {shift:.1f} cm, {1e3 * error[6]:+.1f} ms"
     every, sigmas = "; ".join(cells(error)), "; ".join(sigma_cells(covariance))
-    return short(name), by, sizes, every, sigmas, f"{nees_of(error, covariance):.1f}", more
+    return short(name), by, sizes, every, sigmas, f"{nees(error, covariance) / 7.0:.1f}", more
 
 
 def part(name: str, kept: str) -> Iterator[Sequence[str]]:

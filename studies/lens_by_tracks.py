@@ -20,6 +20,7 @@ from sst_graph import open_source
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.assumptions.model import Scene
 from sst_graph.data.frame_parts import image_at, image_positions
+from sst_graph.experiments.markdown import table
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.odometry.features import Tracks
 from sst_graph.odometry.relative import (
@@ -116,17 +117,14 @@ def estimate(pairs: Sequence[ImagePair], camera: PinholeCamera, name: str) -> tu
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("drives", nargs="+")
-    print(
-        "| drive | parameter | estimate | deviation by stretches | by the tracks' noise |\n"
-        + "|---" * 5
-        + "|"
-    )
+    rows = []
     for drive in parser.parse_args().drives:
         source = open_source(drive)
         pairs = tracked(source)
         for name in LENS:
             value, sigma, least = estimate(pairs, source.camera, name)
-            print(f"| {source.name} | {name} | {value:.3g} | {sigma:.2g} | {least:.2g} |", flush=True)
+            rows.append([source.name, name, f"{value:.3g}", f"{sigma:.2g}", f"{least:.2g}"])
+    print(table("| drive | parameter | estimate | deviation by stretches | by the tracks' noise |", rows))
 
 
 if __name__ == "__main__":

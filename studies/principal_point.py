@@ -23,7 +23,8 @@ from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.experiments.markdown import NONE, lines, table
 from sst_graph.experiments.starts import error_of
 from sst_graph.experiments.wrong_drives import with_principal_point
-from studies.edges_streets import nees_of, short, sigma_cells, source_of, start_step
+from sst_graph.metrics import nees
+from studies.edges_streets import short, sigma_cells, source_of, start_step
 
 HEAD = "| drive | cx, cy off by | prevalence | status | worst axis [sigma] | NEES / 7 | sigmas [deg] |"
 Found = dict[tuple[str, str], list[tuple[str, float]]]
@@ -60,10 +61,10 @@ def rows(options: argparse.Namespace, found: Found) -> Iterator[list[str]]:
                     result = calibrate_prepared(drives, start, config)
                 error = error_of(result.calibration, truth)
                 worst = float(np.abs(error / np.sqrt(np.diag(result.covariance))).max())
-                nees, rotation = nees_of(error, result.covariance), sigma_cells(result.covariance)[0]
+                share, rotation = nees(error, result.covariance) / 7.0, sigma_cells(result.covariance)[0]
                 case = f"{off[0]:g}, {off[1]:g} px", f"{prevalence:g}"
                 found.setdefault(case, []).append((result.status, worst))
-                yield [short(name), *case, result.status, f"{worst:.1f}", f"{nees:.2f}", rotation]
+                yield [short(name), *case, result.status, f"{worst:.1f}", f"{share:.2f}", rotation]
 
 
 def summary(found: Found) -> str:

@@ -32,6 +32,7 @@ from sst_graph.experiments import markdown
 from sst_graph.experiments.starts import error_of
 from sst_graph.experiments.tasks.resumable import Work, rows_of
 from sst_graph.experiments.wrong_drives import WRONG
+from sst_graph.metrics import nees
 from sst_graph.simulator import SimulationConfig, simulate
 
 FIRST_SEED = 20_000
@@ -129,7 +130,7 @@ def row(seed: int, simulator: str, case: str, drive: KeptDrive) -> Row:
         result.status,
         ",".join(name for name, entry in tested.items() if entry["contradicted"]),
         float((np.abs(error) / np.sqrt(np.diag(result.covariance))).max()),
-        float(error @ np.linalg.solve(result.covariance, error)) / len(error),
+        nees(error, result.covariance) / len(error),
     )
 
 
@@ -156,11 +157,11 @@ def table(found: Sequence[Row]) -> str:
     rows = []
     for (case, name), some in sorted(groups.items()):
         counts = [sum(r.status == s for r in some) for s in ("ok", "unobservable", "not_converged")]
-        nees = [r.nees for r in some if r.status != "not_converged"]
+        shares = [r.nees for r in some if r.status != "not_converged"]
         cells = [case, name, str(len(some)), str(sum(bool(r.contradicted) for r in some))]
         cells.append(", ".join(map(str, counts)))
         cells.append(str(sum(r.status == "ok" and r.worst_sigmas > 3.0 for r in some)))
-        cells.append(f"{np.mean(nees):.2f}, {np.median(nees):.2f}" if nees else "–")
+        cells.append(f"{np.mean(shares):.2f}, {np.median(shares):.2f}" if shares else "–")
         rows.append(cells)
     return markdown.table(_HEAD, rows)
 

@@ -26,6 +26,7 @@ import numpy as np
 from sst_graph import CalibrationConfig, calibrate, open_source
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.experiments.markdown import lines, table
+from sst_graph.metrics import nees
 from sst_graph.odometry.sweep import FRACTIONS, SweepDecision, decide_sweep
 from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.types import Calibration, Scan, SemanticClass
@@ -134,7 +135,7 @@ def errors(config: SimulationConfig, timed: bool) -> tuple[list[float], str, str
         float(np.degrees(np.linalg.norm(error[:3]))),
         float(100.0 * np.linalg.norm(error[3:6])),
         float(1e3 * abs(error[6])),
-        float(error @ np.linalg.solve(result.covariance, error)),
+        nees(error, result.covariance),
     ]
     decision = result.diagnostics["sweep"][drive.name]["sentence"]
     return figures, result.status, "times given" if timed else decision

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from benchmarks.tracker_run import PERIOD_NS, endless
 from sst_graph import Tracker, TrackerConfig
+from sst_graph.experiments.markdown import table
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
 from sst_graph.tracker.config import DriftConfig
 from sst_graph.tracker.window.epochs import EPOCH_S
@@ -104,12 +105,13 @@ def main() -> None:
     args = parser.parse_args()
     streets = [run(seed, args.frames) for seed in range(args.streets)]
     mean = {name: float(np.mean([street[name] for street in streets])) for name in streets[0]}
-    print("| | rms error of the history | its sigma | within 1.96 sigma |\n|---|---|---|---|")
+    rows = []
     for what, name, unit in (("yaw", "yaw_deg", "deg"), ("time offset", "offset_ms", "ms")):
         rms, sigma, covered = (mean[f"{name}_{key}"] for key in ("rms", "sigma", "covered_95"))
-        print(f"| {what} | {rms:.3f} {unit} | {sigma:.3f} {unit} | {covered:.0%} |")
+        rows.append([what, f"{rms:.3f} {unit}", f"{sigma:.3f} {unit}", f"{covered:.0%}"])
+    print(table("| | rms error of the history | its sigma | within 1.96 sigma |", rows))
     alarms = sum(street["alarms"] for street in streets)
-    print(f"\nMeans over {len(streets)} streets, {alarms:.0f} alarms, {mean['walked_deg']:.2f} deg of yaw.")
+    print(f"Means over {len(streets)} streets, {alarms:.0f} alarms, {mean['walked_deg']:.2f} deg of yaw.")
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ import gtsam
 import numpy as np
 
 from sst_graph import Tracker
+from sst_graph.metrics import nees
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
 from sst_graph.simulator.config import Motion
 from sst_graph.types import Calibration, CameraImage, Frame
@@ -82,15 +83,15 @@ def _frames_of(tracker: Tracker, frames: list[Frame], step: Step, drive: Simulat
         unconfirmed += update.status == "unconfirmed"
         error = update.calibration.local_coordinates(truth)
         known = np.diag(update.sigmas**2) if update.covariance is None else update.covariance
-        nees = error @ np.linalg.solve(known, error) / 7.0
-        silent += update.status == "ok" and not update.suspected_change and nees > SILENT_NEES
+        share = nees(error, known) / 7.0
+        silent += update.status == "ok" and not update.suspected_change and share > SILENT_NEES
         if k == 0 and tracker.inputs.window.motions:
             motion = tracker.inputs.window.motions[-1]
             speed = float(np.linalg.norm(motion.aTb.translation())) / (1e-9 * (motion.to_ns - motion.from_ns))
     return (
         f"{speed:.1f} | {', '.join(map(str, alarms)) or '–'} | {suspected} | {unconfirmed} | {silent} "
         f"| {update.status} | {np.degrees(np.linalg.norm(error[:3])):.2f} "
-        f"| {100 * np.abs(error[3:6]).mean():.1f} | {1e3 * abs(error[6]):.1f} | {nees:.1f}"
+        f"| {100 * np.abs(error[3:6]).mean():.1f} | {1e3 * abs(error[6]):.1f} | {share:.1f}"
     )
 
 

@@ -19,20 +19,21 @@ from sst_graph.experiments.wrong_drives import with_distortion
 from sst_graph.simulator import SimulatedDrive, SimulationConfig
 from sst_graph.types import CameraImage, Frame, SemanticClass
 
-TRACKED_STREET = SimulationConfig(
+HALF_SIZE = SimulationConfig(
+    width=621, height=188, azimuth_limit_deg=50.0, azimuth_step_deg=0.3, vehicle_density=0.3
+)
+"""A street with many vehicles, at half the usual size."""
+
+TRACKED_STREET = dataclasses.replace(
+    HALF_SIZE,
     seed=3,
     frames=36,
-    width=621,
-    height=188,
-    azimuth_limit_deg=50.0,
-    azimuth_step_deg=0.3,
-    vehicle_density=0.3,
     time_offset_s=0.03,
     motion="no_stop",
     speed_mps=6.0,
     moving_fraction=0.0,
 )
-"""A drive for the tracker, at half the usual size."""
+"""A drive for the tracker."""
 
 SHORT_STREET = SimulationConfig(
     seed=4,
@@ -78,17 +79,8 @@ def prepared_street(label_noise: float = 1.0) -> Drive:
     return stored((street.config, config), lambda: prepare_drive(street, classes, config))
 
 
-CROWDED_STREET = SimulationConfig(
-    seed=5000,
-    frames=20,
-    width=621,
-    height=188,
-    azimuth_limit_deg=50.0,
-    azimuth_step_deg=0.3,
-    vehicle_density=0.3,
-    time_offset_s=0.1,
-)
-"""A drive with a stop past many vehicles, at half the usual size."""
+CROWDED_STREET = dataclasses.replace(HALF_SIZE, seed=5000, frames=20, time_offset_s=0.1)
+"""A drive with a stop past many vehicles."""
 
 
 @cache

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from calibrations import turned
 from stored import written
+from streets import HALF_SIZE
 
 from sst_graph.cli import main
 from sst_graph.export import CalibrationMarginal
@@ -110,18 +111,7 @@ def test_a_lens_in_python(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_calibration_in_your_own_graph(tmp_path: Path) -> None:
-    street = SimulationConfig(
-        seed=5,
-        frames=16,
-        width=621,
-        height=188,
-        azimuth_limit_deg=50.0,
-        azimuth_step_deg=0.3,
-        vehicle_density=0.3,
-        time_offset_s=0.03,
-        motion="no_stop",
-        moving_fraction=0.0,
-    )
+    street = replace(HALF_SIZE, seed=5, frames=16, time_offset_s=0.03, motion="no_stop", moving_fraction=0.0)
     (tmp_path / "drive").symlink_to(written(street))
     found: dict[str, Any] = {}
     exec(compile(code_of("graph/slam.md"), "slam.md", "exec"), found)

@@ -159,9 +159,7 @@ def _groups(pairs: Sequence[PairMatches]) -> list[_Group]:
 
 
 def _joined(terms: Sequence[FrameTerm]) -> FrameTerm:
-    """The sum of some frames' factors."""
-    if len(terms) == 1:
-        return terms[0]
+    """The sum of some factors, their columns rising."""
     columns = np.unique(np.concatenate([term.columns for term in terms]))
     H, g = np.zeros((len(columns), len(columns))), np.zeros(len(columns))
     for term in terms:
@@ -182,7 +180,7 @@ def _frame_information(
     """(n, n) information of all that no twist takes part in; the rest by twist."""
     n, known = unknowns.size, set(unknowns.keys)
     prior = np.zeros((n, n))
-    terms: dict[int, list[tuple[IntArray, FloatArray]]] = {}
+    terms: dict[int, list[FrameTerm]] = {}
     linear = graph.linearize(values)
     for i in range(linear.size()):
         factor = linear.at(i)
@@ -192,10 +190,12 @@ def _frame_information(
             raise ValueError(f"a factor on {count_of(len(twists), 'twist')}: frames are no longer separate")
         columns = np.concatenate([_columns(key, unknowns) for key in keys])
         if twists:
-            terms.setdefault(twists[0], []).append((columns, factor.augmentedInformation()))
+            augmented = factor.augmentedInformation()
+            term = FrameTerm(columns, augmented[:-1, :-1], augmented[:-1, -1])
+            terms.setdefault(twists[0], []).append(term)
         else:
             prior[np.ix_(columns, columns)] += factor.information()
-    return prior, {twist: _marginal(found, n) for twist, found in terms.items()}
+    return prior, {twist: _marginal(_joined(found), n) for twist, found in terms.items()}
 
 
 def _columns(key: int, unknowns: Unknowns) -> IntArray:
@@ -205,14 +205,9 @@ def _columns(key: int, unknowns: Unknowns) -> IntArray:
     return np.arange(first, first + (6 if first == 0 else 1))
 
 
-def _marginal(terms: Sequence[tuple[IntArray, FloatArray]], n: int) -> FrameTerm:
-    """From augmented information, on the columns below ``n``, with the twist marginalised out."""
-    columns = np.unique(np.concatenate([columns for columns, _ in terms]))
-    H, g = np.zeros((len(columns), len(columns))), np.zeros(len(columns))
-    for touched, augmented in terms:
-        at = np.searchsorted(columns, touched)
-        H[np.ix_(at, at)] += augmented[:-1, :-1]
-        g[at] += augmented[:-1, -1]
+def _marginal(term: FrameTerm, n: int) -> FrameTerm:
+    """On the columns below ``n``, with the twist marginalised out."""
+    columns, H, g = term.columns, term.information, term.vector
     m = int(np.searchsorted(columns, n))
     response = np.linalg.solve(H[m:, m:], H[m:, :m])
     return FrameTerm(columns[:m], H[:m, :m] - H[:m, m:] @ response, g[:m] - response.T @ g[m:])

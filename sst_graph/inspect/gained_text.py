@@ -17,9 +17,10 @@ MOST_FRAMES = 12
 SHORT = ("rot x", "rot y", "rot z", "x", "y", "z", "offset")
 
 _NOTHING = {
-    "paper": "every matched pixel counts as independent, in the frame and beside its neighbours",
-    "static": "every matched pixel counts as independent, in the frame and beside its neighbours",
-    "semalign": "every matched pixel counts as independent, in the frame and beside its neighbours",
+    **dict.fromkeys(
+        ("paper", "static", "semalign"),
+        "every matched pixel counts as independent, in the frame and beside its neighbours",
+    ),
     "both": "labels and edges are estimated by themselves, and their estimates joined",
     "track": "this tracker followed a drift, or found no start: what a frame brings fades again",
 }

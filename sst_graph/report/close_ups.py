@@ -15,12 +15,13 @@ from sst_graph.factors import residuals
 from sst_graph.factors.matches import Alignment
 from sst_graph.features.mask_contour import ContourMap
 from sst_graph.fit import CLOSE_PX, Fit, PointResiduals
+from sst_graph.graph.linear import covariance_root
 from sst_graph.inspect.misfit import LENS_COUNTS
 from sst_graph.inspect.pixels import covariance_of_given_lens, drawn_covariance
 from sst_graph.report.drawn_frame import DrawnFrame, DriveReader
 from sst_graph.report.html import jpeg, text
 from sst_graph.report.overlay import CLASS_NAMES, Placements, project_points
-from sst_graph.report.residual_charts import object_numbers
+from sst_graph.report.residual_charts import mean_residual_px, object_numbers
 from sst_graph.result import CalibrationResult
 from sst_graph.types import FloatArray, IntArray, SemanticClass
 
@@ -122,7 +123,7 @@ def _misfit_px(points: PointResiduals) -> float:
     """How far an object is off [px]: single edges of pictures often are, the mean of an object's is not."""
     if _has_contours(points):
         return float(np.median(np.abs(points.residuals_px)))
-    return abs(_mean(points, np.ones(len(points), np.bool_)))
+    return abs(mean_residual_px(points, slice(None)))
 
 
 def close_ups(
@@ -153,8 +154,7 @@ def _by_detection(points: PointResiduals) -> list[IntArray]:
 
 def _leverages(points: PointResiduals, covariance: FloatArray) -> FloatArray:
     """(n,) part of each point in the information, in units of the result's."""
-    values, vectors = np.linalg.eigh(covariance)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    root, _ = covariance_root(covariance)
     return np.asarray(points.weights * ((points.J @ root) ** 2).sum(axis=1) / points.sigmas_px**2)
 
 
@@ -185,7 +185,7 @@ def _close_up(
     if result.fit_is_check:
         information = ""
     sides = ", ".join(
-        f"{_SIDE_NAMES[side]} {_mean(points, points.sides == side):+z.1f} px"
+        f"{_SIDE_NAMES[side]} {mean_residual_px(points, points.sides == side):+z.1f} px"
         for side in np.unique(points.sides)
     )
     column, row = (0.5 * np.array([crop.left + crop.right, crop.top + crop.bottom])).astype(int)
@@ -222,11 +222,6 @@ def _has_contours(points: PointResiduals) -> bool:
     return int(points.classes[0]) != SemanticClass.OBJECT
 
 
-def _mean(points: PointResiduals, chosen: NDArray[np.bool_]) -> float:
-    """Mean residual of some points, those that are far off weighed down [px]."""
-    return float(np.average(points.residuals_px[chosen], weights=points.weights[chosen] + 1e-9))
-
-
 def _uv_H_unknowns(drawn: DrawnFrame, points: PointResiduals, placements: Placements) -> FloatArray:
     """(n, 2, 7) derivative of the pixels by extrinsic and time offset."""
     cTl, time_offset_s = placements.after
@@ -250,8 +245,7 @@ def _two_sigma_moves(A: FloatArray, covariance: FloatArray) -> FloatArray:
     Args:
         A: (n, 2, 7) derivative of the pixels by extrinsic and time offset.
     """
-    values, vectors = np.linalg.eigh(covariance)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    root, _ = covariance_root(covariance)
     reaches = A.reshape(-1, 7) @ root
     _, directions = np.linalg.eigh(reaches.T @ reaches)
     return np.asarray(2.0 * A @ (root @ directions[:, -1]))

@@ -10,7 +10,7 @@ from sst_graph.fit import CLOSE_PX, Fit, PointResiduals
 from sst_graph.report.chart import BROAD, Chart
 from sst_graph.report.html import figure, numbered
 from sst_graph.report.overlay import CLASS_NAMES
-from sst_graph.types import FloatArray, IntArray, SemanticClass
+from sst_graph.types import BoolArray, FloatArray, IntArray, SemanticClass
 
 _MOST_OBJECTS = 30
 """Objects of the chart: those with the most points."""
@@ -179,10 +179,13 @@ def _objects(points: PointResiduals) -> list[tuple[IntArray, float]]:
     groups = sorted(groups, key=len, reverse=True)[:_MOST_OBJECTS]
     if len(groups) < 2:
         return []
-    middles = [
-        float(np.average(points.residuals_px[own], weights=points.weights[own] + 1e-9)) for own in groups
-    ]
+    middles = [mean_residual_px(points, own) for own in groups]
     return [(groups[k], middles[k]) for k in np.argsort(middles)]
+
+
+def mean_residual_px(points: PointResiduals, chosen: IntArray | BoolArray | slice) -> float:
+    """Mean residual of some points, those that are far off weighed down [px]."""
+    return float(np.average(points.residuals_px[chosen], weights=points.weights[chosen] + 1e-9))
 
 
 def _name(points: PointResiduals) -> str:

@@ -41,11 +41,12 @@ def score_findings(smoother: WindowSmoother, config: AssumptionConfig) -> tuple[
     follows = -(inverted(H[:n, :n]) @ H[:n, n:])
     A = np.concatenate([follows, np.eye(smoother.past.held)])
     score, information = A.T @ g, np.einsum("nk,nm,mk->k", A, H, A)
-    beyond = smoother.excess(with_held=True) + smoother.shift_excess()[1].sum(axis=0)
+    sums = smoother.sums_on_last_epoch()
+    beyond = sums.excess(smoother.model, with_held=True) + sums.shift_excess.sum(axis=0)
     excess = np.einsum("nk,nm,mk->k", A, beyond, A)
     spans = {name: assumption.span for name, assumption in ASSUMPTIONS.items()}
     before = np.array([spans.get(name, 1.0) ** -2.0 for name in smoother.held_names])
-    curvature = np.maximum(information, 0.0) / bounded_ratio(smoother.weight_curvature_ratio) + before
+    curvature = np.maximum(information, 0.0) / bounded_ratio(sums.weight_curvature_ratio) + before
     values = score / curvature
     sigmas = np.sqrt(np.maximum(information + excess, 0.0) + before) / curvature
     sigmas *= few_objects_factor(smoother.objects, config.threshold)

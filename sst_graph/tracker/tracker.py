@@ -11,7 +11,7 @@ import numpy as np
 
 from sst_graph.config import expect_settings
 from sst_graph.drive.stamp_intervals import Jump
-from sst_graph.errors import DataError, EstimationError
+from sst_graph.errors import DataError, EstimationError, one_line
 from sst_graph.factors.arguments import checked_count, checked_type
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.floating_point import with_usual_errors
@@ -276,7 +276,7 @@ class Tracker:
         try:
             initialization = self.initializer.work(self.matcher)
         except NUMERICAL_ERRORS as error:
-            why = " ".join(str(error).split())
+            why = one_line(error)
             self.initializer.failed(why)
             return make_update(self, stamp_ns, f"no start yet: {why}")
         if initialization is not None:
@@ -292,7 +292,7 @@ class Tracker:
             initialization = self.initializer.finish(self.matcher)
         except NUMERICAL_ERRORS as error:
             _LOG.warning("tracker: no start: %s", error)
-            self.initializer.why = " ".join(str(error).split())
+            self.initializer.why = one_line(error)
             return False
         if initialization is not None:
             self._begin(initialization, self.inputs.window.last_stamp_ns or 0)

@@ -15,6 +15,7 @@ from sst_graph.errors import EstimationError
 from sst_graph.graph.linear import scaled_inverse
 from sst_graph.tracker.monitor.statistic import ComparedEstimate, EstimateCovariance
 from sst_graph.tracker.sums.held import EDGE_ERRORS, SHIFTS
+from sst_graph.tracker.sums.running_sums import RunningSums
 from sst_graph.tracker.window.smoother import WindowSmoother
 from sst_graph.types import FloatArray
 
@@ -57,8 +58,8 @@ class Uncertainty:
         Raises:
             EstimationError: it has no covariance.
         """
-        information = smoother.information()
-        matrix, naive = smoother.covariance(information)
+        information, sums = smoother.information(), smoother.sums_on_last_epoch()
+        matrix, naive = smoother.covariance(information, sums)
         if not (np.isfinite(matrix).all() and (np.diag(matrix) > 0.0).all()):
             raise EstimationError("a covariance that is not finite")
         m = smoother.past.point.core_size
@@ -73,7 +74,7 @@ class Uncertainty:
         steps = {name: step for name, step in held.items() if name not in EDGE_ERRORS}
         positions = np.array([held[name] for name in POSITIONS if name in held]).reshape(-1, 7)
         share = np.array([-held[name] for name in SHIFTS if name in held]).reshape(-1, 7).T
-        shifts, by_shifts = _shifts(smoother, naive)
+        shifts, by_shifts = _shifts(sums, naive)
         joint = EstimateCovariance(matrix + by_shifts, smoother.past.point.tracks, m)
         return cls(joint, inflation, by_static_objects, steps, positions, share, shifts)
 
@@ -89,13 +90,12 @@ class Uncertainty:
         return self.joint.matrix[:m, :m]
 
 
-def _shifts(smoother: WindowSmoother, naive: FloatArray) -> tuple[ImageShifts, FloatArray]:
+def _shifts(sums: RunningSums, naive: FloatArray) -> tuple[ImageShifts, FloatArray]:
     """Shifts of pictures and stamps from image to image, and (n, n) what they add to the covariance.
 
     Args:
         naive: (n, n) covariance of independent matches.
     """
     n = len(naive)
-    variances, excess = smoother.shift_excess()
-    parts = naive @ excess[:, :n, :n] @ naive
-    return ImageShifts(np.sqrt(variances), parts[:, :7, :7]), np.asarray(parts.sum(axis=0))
+    parts = naive @ sums.shift_excess[:, :n, :n] @ naive
+    return ImageShifts(np.sqrt(sums.shift_variances), parts[:, :7, :7]), np.asarray(parts.sum(axis=0))

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 import gtsam
 
 from sst_graph.batch import CalibrationConfig
+from sst_graph.errors import one_line
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.spread_work import NUMERICAL_ERRORS
@@ -43,7 +44,7 @@ def views_under(
         try:
             _take(tracker, frame)
         except NUMERICAL_ERRORS as error:
-            _LOG.warning("frame %d is not shown: %s", frame.index, " ".join(str(error).split()))
+            _LOG.warning("frame %d is not shown: %s", frame.index, one_line(error))
         yield from views.taken(frame, before, point)
     yield from views.rest(point)
 

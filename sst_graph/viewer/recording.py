@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.errors import ConfigError, optional_module
+from sst_graph.errors import ConfigError, one_line, optional_module
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.inspect.inspection import HUMAN
 from sst_graph.sampling import step_for
@@ -112,7 +112,7 @@ class Recording:
         try:
             self._stream.flush(timeout_sec=_LONGEST_FLUSH_S)
         except Exception as error:
-            why = " ".join(str(error).split())
+            why = one_line(error)
             raise ConfigError(f"the viewer rerun has gone: {why} (without a screen, save a file)") from error
         finally:
             self._stream.disconnect()
@@ -200,7 +200,7 @@ class Recording:
             # Without the recording, the global one is asked, and says that it is disabled.
             rr.spawn(connect=False, recording=self._stream, executable_path=_executable())
         except Exception as error:
-            why = " ".join(str(error).split())
+            why = one_line(error)
             raise ConfigError(f"the viewer rerun cannot be opened: {why} (or save a file)") from error
         return [rr.GrpcSink()]
 

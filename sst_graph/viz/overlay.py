@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
+from sst_graph.factors.motion import CameraTwist, moved_points
 from sst_graph.features.mask_contour import ContourMap
-from sst_graph.points import transformed_points
 from sst_graph.types import Calibration, CameraImage, FloatArray, Frame, Scan, SemanticClass
 
 Picture = NDArray[np.uint8]
@@ -47,8 +47,6 @@ MIN_WIDTH_PX = 720
 
 _LEAST_SCALE = 0.1
 """Of letters: smaller ones cannot be read."""
-TIME_STEP_S = 0.5e-3
-"""Points of a rolling sweep are moved in steps of this [s]; at 15 m/s the rest is 4 mm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,27 +159,17 @@ def _projected(
     c_twist: FloatArray | None,
 ) -> tuple[FloatArray, NDArray[np.uint8], FloatArray]:
     """Pixels (m, 2), classes (m,) and depths (m,) [m] of the points on the image, far ones first."""
-    cPs = transformed_points(cTl, scan.points.astype(np.float64))
-    if c_twist is not None:
-        tau = (image.stamp_ns - scan.stamp_ns) * 1e-9 + time_offset_s
-        offsets_s = np.zeros(len(cPs)) if scan.offsets_s is None else scan.offsets_s.astype(np.float64)
-        cPs = _moved(cPs, tau - offsets_s, c_twist)
+    lPs = scan.points.astype(np.float64)
+    taus_s = np.full(len(lPs), (image.stamp_ns - scan.stamp_ns) * 1e-9 + time_offset_s)
+    if scan.offsets_s is not None:
+        taus_s -= scan.offsets_s
+    motion = CameraTwist(np.zeros(6) if c_twist is None else c_twist, np.zeros(6))
+    cPs = moved_points(cTl, lPs.T, taus_s, motion, "se3", None).cPs.T
     uvs = camera.project(cPs)
     seen = np.flatnonzero(camera.in_front(cPs))
     seen = seen[camera.in_image(uvs[seen])]
     seen = seen[np.argsort(-cPs[seen, 2])]
     return uvs[seen], scan.classes[seen], cPs[seen, 2]
-
-
-def _moved(cPs: FloatArray, taus_s: FloatArray, c_twist: FloatArray) -> FloatArray:
-    """cP(tau) = Exp(-c_twist tau) . cP for points (n, 3) [m] and intervals (n,) [s]."""
-    moved = np.empty_like(cPs)
-    steps = np.round(taus_s / TIME_STEP_S).astype(np.int64)
-    for step in np.unique(steps):
-        chosen = steps == step
-        motion = gtsam.Pose3.Expmap(-c_twist * float(taus_s[chosen].mean()))
-        moved[chosen] = transformed_points(motion, cPs[chosen])
-    return moved
 
 
 def _backdrop(image: CameraImage) -> Picture:

@@ -22,6 +22,7 @@ from third_street import ThirdConfig, ThirdStreet
 from sst_graph import CalibrationConfig, calibrate
 from sst_graph.experiments.markdown import lines, median_worst, status_counts
 from sst_graph.experiments.starts import error_of
+from sst_graph.metrics import nees
 from sst_graph.types import SemanticClass
 
 HEAD = (
@@ -62,8 +63,7 @@ def run(street: Street, classes: tuple[SemanticClass, ...], guess: bool) -> tupl
     shift = result.T_camera_lidar.translation() - truth.cTl.translation()
     figures = [np.degrees(np.linalg.norm(error[:3])), 100 * np.abs(shift).mean(), 1e3 * abs(error[6])]
     for part in (slice(0, 3), slice(3, 6), slice(6, 7), slice(0, 7)):
-        own = error[part]
-        figures.append(float(own @ np.linalg.solve(result.covariance[part, part], own)) / len(own))
+        figures.append(nees(error[part], result.covariance[part, part]) / len(error[part]))
     return [float(figure) for figure in figures], result.status
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +14,6 @@ import pytest
 from sst_graph.batch.config import CalibrationConfig
 from studies import ablation
 from studies.ablation_cases import CASES, NOTHING, Case, replaced, to
-
-DOCS = Path(__file__).resolve().parents[2] / "docs"
-PAGE = """# Worth
-
-<!-- table: python -m studies.ablation run --out out/ablation.jsonl --streets third:1 --frames 6 -->
-<!-- end of table -->
-
-<!-- table: sst-graph experiment fit -->
-<!-- end of table -->
-"""
 
 
 def value_of(place: str) -> Any:
@@ -77,19 +68,10 @@ def test_what_cannot_be_replaced_everywhere_is_refused(place: str, error: str) -
         pass
 
 
-def record(case: str, error: float, sigma: float = 0.01, data: str = "first-9300") -> dict[str, Any]:
+def record(case: str, error: float, sigma: float = 0.01, data: str = "first-9300") -> ablation.Record:
     """A run, its errors and sigmas the same on all axes."""
-    return {
-        "method": "joint",
-        "data": data,
-        "case": case,
-        "error": [error] * 7,
-        "covariance": (sigma**2 * np.eye(7)).tolist(),
-        "status": "ok",
-        "reasons": [],
-        "seconds": 2.0,
-        "commit": "abcdef12",
-    }
+    covariance = (sigma**2 * np.eye(7)).tolist()
+    return ablation.Record("joint", data, case, "", [error] * 7, covariance, "ok", seconds=2.0)
 
 
 @pytest.mark.parametrize(
@@ -114,17 +96,8 @@ def test_a_ratio_is_the_mean_over_rotation_translation_and_offset() -> None:
     full, other = (ablation.Run.of(record("roofs", error)) for error in (1.0, 2.0))
     assert np.exp(other.log_ratio(full)) == pytest.approx(2.0, rel=1e-4)
     # At one speed: what an offset does to the shift along the road is no error.
-    late = record("roofs", 0.0, data="parked") | {"error": [0.0, 0.0, 0.0, 0.109, 0.0, 0.0, 0.01]}
+    late = replace(record("roofs", 0.0, data="parked"), error=[0.0, 0.0, 0.0, 0.109, 0.0, 0.0, 0.01])
     assert ablation.Run.of(late).sizes == pytest.approx([0.0, 0.0], abs=1e-12)
-
-
-def test_runs_of_another_package_are_refused() -> None:
-    old = ablation._git("log", "-1", "--format=%h", "--skip=1", "--", "sst_graph")
-    if not old:
-        pytest.skip("a checkout without history")
-    runs = [record("nothing", 0.0) | {"commit": commit} for commit in (old, "HEAD")]
-    with pytest.raises(SystemExit, match="one package"):
-        ablation.commit_of(runs)
 
 
 def test_an_unknown_case_is_refused() -> None:
@@ -135,21 +108,18 @@ def test_an_unknown_case_is_refused() -> None:
 
 @pytest.mark.slow
 def test_two_cases_on_a_tiny_street_make_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    runs, page = tmp_path / "runs.jsonl", tmp_path / "page.md"
-    words = ["run", "--out", str(runs), "--streets", "third:1", "--frames", "6", "--cases", "roofs,clusters"]
+    runs = tmp_path / "runs.jsonl"
+    words = ["--records", str(runs), "--streets", "third:1", "--frames", "6", "--cases", "roofs,clusters"]
     ablation.main(words)
     printed = capsys.readouterr().out
     assert "`roofs`" in printed and "`clusters`" in printed and "| third | 1 |" in printed
-    records = [json.loads(line) for line in runs.read_text().splitlines()]
-    assert [one["case"] for one in records] == ["nothing", "lean", "roofs", "clusters"]
-    assert records[0]["error"] == records[1]["error"] == records[3]["error"] != records[2]["error"]
+    (nothing,), (lean,), (roofs,), (clusters,) = (
+        json.loads(line)["rows"] for line in runs.read_text().splitlines()[1:]
+    )
+    assert [one["case"] for one in (lean, roofs, clusters)] == ["lean", "roofs", "clusters"]
+    assert nothing["error"] == lean["error"] == clusters["error"] != roofs["error"]
     # What the file has is not run again; a line that was cut off is.
     content = runs.read_text()
     runs.write_text(content + '{"method": "jo')
     ablation.main(words)
-    assert runs.read_text() == content
-    page.write_text(PAGE)
-    ablation.main(["table", str(runs), "--into", str(page)])
-    first, second = ablation.make_tables.tables_of(page)
-    assert (first.commit, second.commit) == (records[0]["commit"], "")
-    assert "`clusters`" in page.read_text()
+    assert runs.read_text() == content and capsys.readouterr().out == printed

@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 import pytest
 from stored import simulated
+from streets import HALF_SIZE
 
 from sst_graph import Tracker, TrackerConfig
 from sst_graph.batch.lower_edges import with_lower_edges
@@ -18,7 +19,6 @@ from sst_graph.graph.outer_loop import KERNELS_PX, JointProblem, solve_joint
 from sst_graph.graph.state import State, lower_edge_track
 from sst_graph.objects.dynamic_objects import find_dynamic_objects
 from sst_graph.objects.tracks import object_tracks
-from sst_graph.simulator import SimulationConfig
 from sst_graph.types import SemanticClass
 
 
@@ -27,14 +27,10 @@ from sst_graph.types import SemanticClass
 def test_the_tracker_ends_where_the_batch_does(by_object: bool) -> None:
     """With a mask bias for each object and moving cars left out, and with one bias a class."""
     street = simulated(
-        SimulationConfig(
+        dataclasses.replace(
+            HALF_SIZE,
             seed=5,
             frames=30,
-            width=621,
-            height=188,
-            azimuth_limit_deg=50.0,
-            azimuth_step_deg=0.3,
-            vehicle_density=0.3,
             time_offset_s=0.04,
             speed_mps=6.0,
             moving_fraction=0.3 if by_object else 0.0,

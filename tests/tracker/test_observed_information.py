@@ -6,9 +6,10 @@ import dataclasses
 
 import numpy as np
 import pytest
+from streets import HALF_SIZE
 
 from sst_graph import Tracker, TrackerConfig
-from sst_graph.simulator import SimulationConfig, simulate
+from sst_graph.simulator import simulate
 from sst_graph.tracker.sums.linearized_pair import linearize_pairs
 from sst_graph.tracker.sums.rows import PairColumns
 
@@ -17,17 +18,7 @@ from sst_graph.tracker.sums.rows import PairColumns
 def tracker() -> Tracker:
     """After 24 frames, of which most have left the window."""
     street = simulate(
-        SimulationConfig(
-            seed=3,
-            frames=24,
-            width=621,
-            height=188,
-            azimuth_limit_deg=50.0,
-            azimuth_step_deg=0.3,
-            vehicle_density=0.3,
-            time_offset_s=0.05,
-            motion="stop_and_go",
-        )
+        dataclasses.replace(HALF_SIZE, seed=3, frames=24, time_offset_s=0.05, motion="stop_and_go")
     )
     default = TrackerConfig(start_scans=8, window=10)
     search = dataclasses.replace(default.calibration.search, enabled=False)

@@ -265,19 +265,19 @@ def test_score_sums_follow_the_objects() -> None:
     score, sums, model = _score(rng, np.zeros(N), 0), RunningSums.empty(N), ErrorModel(0.25, 0.1, 2.0)
     columns = np.arange(N)
     sums.add(score, columns, 0)
-    expected = sums.excess([], [], model)
+    expected = sums.excess(model)
     sums.grow(N + 2)
-    grown = sums.excess([], [], model)
+    grown = sums.excess(model)
     np.testing.assert_allclose(grown[:N, :N], expected)
     assert not grown[N:].any()
     # A pair counts the same in the window as when it has left it.
     again = _score(rng, np.zeros(N), 2)
-    both = sums.excess([again], [columns], model)
+    both = sums.with_pairs([again], [columns]).excess(model)
     sums.add(again, columns, 1)
-    np.testing.assert_allclose(sums.excess([], [], model), both, rtol=1e-9)
+    np.testing.assert_allclose(sums.excess(model), both, rtol=1e-9)
     T = rng.standard_normal((N, N + 2))
     sums.transform(T)
-    np.testing.assert_allclose(sums.excess([], [], model), T @ both @ T.T, rtol=1e-9)
+    np.testing.assert_allclose(sums.excess(model), T @ both @ T.T, rtol=1e-9)
 
 
 def test_a_new_object_is_as_uncertain_as_its_class_and_more() -> None:

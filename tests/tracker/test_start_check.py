@@ -97,7 +97,8 @@ def test_a_start_is_confirmed_though_the_labels_of_one_vehicle_contradict_it(
     changes, estimate = tracker.monitor.changes, tracker.estimate.for_comparison()
     moving = tracker.inputs.window.dynamics.recently_moving()
     pairs = changes.matcher.pairs_at(estimate.point, sorted(estimate.scans), _KERNEL)
-    scores = {scan: changes._scores({scan: pair}, estimate, moving) for scan, pair in pairs.items()}
+    linearized = changes.matcher.linearized
+    scores = {scan: linearized({scan: pair}, estimate.point, moving) for scan, pair in pairs.items()}
     assert changes._largest_of_parts(scores, estimate)[0] > changes.start_threshold
 
 

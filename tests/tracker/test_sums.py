@@ -93,11 +93,12 @@ def test_the_sums_are_the_batch_s(
         [robust.model.side, robust.model.side_frame, robust.model.match],
         rtol=1e-9,
     )
-    excess = sums.excess(window, own, model)[np.ix_(columns, columns)]
+    whole = sums.with_pairs(window, own)
+    excess = whole.excess(model)[np.ix_(columns, columns)]
     expected = robust.table.scores.excess(robust.model)
     scale = unit_scale(expected) * (np.diag(expected) > 0.0)
     np.testing.assert_allclose(excess * np.outer(scale, scale), expected * np.outer(scale, scale), atol=1e-9)
-    ratio = sums.weight_curvature_ratio(window)
+    ratio = whole.weight_curvature_ratio
     assert ratio == pytest.approx(robust.table.weight_curvature_ratio, rel=1e-9)
     # The whole covariance, given that of independent matches: with the batch's jackknife the same, with the
     # tracker's nearly. There an object's matches have no columns of other objects' biases, which the twist of
@@ -109,7 +110,7 @@ def test_the_sums_are_the_batch_s(
     steps = steps_without_objects(robust.table, robust.bread)
     of_batch = ObjectSpread.of(steps, robust.table.object_weights)
     assert spread.number == pytest.approx(of_batch.number, rel=1e-9)
-    by_model = naive + naive @ sums.excess(window, own, model) @ naive
+    by_model = naive + naive @ whole.excess(model) @ naive
     exact = composed(by_model[np.ix_(columns, columns)], of_batch, ratio)[:7, :7]
     found = composed(by_model, spread, ratio)[:7, :7]
     sigmas = np.sqrt(np.diag(robust.matrix)[:7])
@@ -124,14 +125,14 @@ def test_shifts_from_image_to_image_are_the_batch_s(
 ) -> None:
     robust, pairs, point, linear = matched
     columns, (sums, window, own) = _columns(robust, point), _parted(point, linear, left)
-    variances, excess = sums.shift_excess(window, own)
+    whole = sums.with_pairs(window, own)
     state = State(point.cTl, (OFFSET_S,))
     values = joint_graph(pairs, state, CONFIG)[1]
     by_image = columns_by_image(robust.table, pairs, values, state)
     batch = shifts_of(robust.table, robust.bread, *by_image)
     assert batch.sigmas.max() > 0.0
-    np.testing.assert_allclose(np.sqrt(variances), batch.sigmas, rtol=1e-7)
-    found = robust.bread @ excess[:, columns[:, None], columns] @ robust.bread
+    np.testing.assert_allclose(np.sqrt(whole.shift_variances), batch.sigmas, rtol=1e-7)
+    found = robust.bread @ whole.shift_excess[:, columns[:, None], columns] @ robust.bread
     scale = unit_scale(batch.covariance)
     np.testing.assert_allclose(
         found * np.outer(scale, scale), batch.parts * np.outer(scale, scale), atol=1e-7

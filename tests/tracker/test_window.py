@@ -91,8 +91,7 @@ def test_poses_are_kept_as_long_as_their_scans() -> None:
     window, poses = _window(drive, 8), scan_poses(drive)
     numbers = [number for number, _ in window.scans]
     assert 0 < len(numbers) <= 8 and sorted(window.poses) == numbers
-    for number, wTl in zip(numbers, window.poses_of(numbers), strict=True):
-        assert wTl.equals(poses[number], 1e-9)
+    assert all(window.poses[number].equals(poses[number], 1e-9) for number in numbers)
 
 
 def test_an_object_that_starts_to_move_changes_past_scans() -> None:

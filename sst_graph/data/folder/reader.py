@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +27,7 @@ from sst_graph.data.point_times import PointClock, ScanTimes, clock_of_points
 from sst_graph.data.rectified import RectifiedSource
 from sst_graph.data.source import Loader, SourceOptions
 from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
-from sst_graph.errors import ConfigError, DataError, MissingDependencyError, count_of, printable
+from sst_graph.errors import ConfigError, DataError, count_of, printable
 from sst_graph.types import CameraImage, Scan, Source, with_intensities
 
 _LOG = logging.getLogger(__name__)
@@ -91,6 +91,12 @@ class CloudFiles:
         )
         return with_intensities(scan, None if intensities is None else intensities[used])
 
+    def times(self, k: int) -> ScanTimes | None:
+        """Times of the points of scan k; errors as of a scan."""
+        cloud = read_cloud(self.files.paths[k])
+        values, used = cloud.times(), np.isfinite(cloud.points()).all(axis=1)
+        return None if values is None else ScanTimes(int(self.files.stamps_ns[k]), values[used])
+
     def _labels(
         self, k: int, cloud: PointFields, used: NDArray[np.bool_]
     ) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
@@ -126,8 +132,9 @@ def open_folder(path: Path, options: SourceOptions) -> Source:
     masks = _beside(images, own / "masks", (".png",))
     encoding = mask_encoding(masks, options.label_encoding, size)
     pictures = PictureFiles(size, dict(enumerate(images.paths)), masks, encoding)
-    clock, of_clock = _clock(clouds, options)
-    scans = CloudFiles(clouds, _beside(clouds, path / "labels", (".label",)), options.sweep == "auto", clock)
+    scans = CloudFiles(clouds, _beside(clouds, path / "labels", (".label",)), options.sweep == "auto")
+    clock, of_clock = clock_of_points(scans.times, len(clouds.paths), options)
+    scans = replace(scans, clock=clock)
 
     def image(k: int) -> CameraImage:
         return pictures.image(k, int(images.stamps_ns[k]))
@@ -140,22 +147,6 @@ def open_folder(path: Path, options: SourceOptions) -> Source:
     of_images = Sensor(images.stamps_ns, image, _IMAGES)
     drive = merged(properties, of_scans, of_images, options, path)
     return drive if model.is_pinhole else RectifiedSource(drive, Rectification.of(model))
-
-
-def _clock(clouds: StampedFiles, options: SourceOptions) -> tuple[PointClock | None, str]:
-    """The clock of the points' times, where it is not that of the stamps, and a sentence on it."""
-    if options.sweep != "auto":
-        return None, ""
-
-    def read(k: int) -> ScanTimes | None:
-        try:
-            cloud = read_cloud(clouds.paths[k])
-            values, used = cloud.times(), np.isfinite(cloud.points()).all(axis=1)
-        except (DataError, MissingDependencyError):  # which the scan will raise when it is read
-            return None
-        return None if values is None else ScanTimes(int(clouds.stamps_ns[k]), values[used])
-
-    return clock_of_points(read, len(clouds.paths), options.sweep_stamp)
 
 
 def _check_options(path: Path, options: SourceOptions) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +25,8 @@ from sst_graph.data.point_times.seconds import (
     tells_nothing,
     units_ns,
 )
-from sst_graph.errors import count_of
+from sst_graph.data.source import SourceOptions
+from sst_graph.errors import DataError, MissingDependencyError, count_of
 from sst_graph.sampling import evenly_spread
 from sst_graph.spread import robust_spread
 from sst_graph.sweep_timing import SweepStamp
@@ -109,7 +111,7 @@ def seconds_after_stamp(
 
 
 def clock_of_points(
-    read: Callable[[int], ScanTimes | None], count: int, stamp: SweepStamp
+    read: Callable[[int], ScanTimes | None], count: int, options: SourceOptions
 ) -> tuple[PointClock | None, str]:
     """The clock of a drive's points, where it is another one than that of the stamps, and a sentence on it;
     without a clock, on why it is not known; empty where the times are of the stamps' clock.
@@ -120,14 +122,26 @@ def clock_of_points(
     0.7 of a sweep after their stamps (median), these are those of the ends. Otherwise they are of the starts.
 
     Args:
-        read: times of scan k; None where it has none.
+        read: times of scan k; None where it has none. An error of the data counts as none: whoever reads the
+            scan meets it.
         count: of the scans.
-        stamp: the instant that a scan's stamp names; "forward": not said.
+        options: whether stored times are taken, and the instant that a scan's stamp names.
     """
-    looked_at = [times for k in evenly_spread(range(count), _LOOKED_AT) if (times := read(k)) is not None]
+    if options.sweep != "auto":
+        return None, ""
+
+    def spread(most: int) -> list[ScanTimes]:
+        """Times of some scans over the drive."""
+        found = []
+        for k in evenly_spread(range(count), most):
+            with suppress(DataError, MissingDependencyError):
+                found.append(read(k))
+        return [times for times in found if times is not None]
+
+    looked_at = spread(_LOOKED_AT)
     if not any(times.are_far() for times in looked_at):
         return None, ""
-    scans = [times for k in evenly_spread(range(count), _COMPARED) if (times := read(k)) is not None]
+    scans = spread(_COMPARED)
     telling = sum(not tells_nothing(times.values) for times in scans)
     scans = [times for times in scans if times.are_far()]
     if 2 * len(scans) <= telling:
@@ -137,7 +151,7 @@ def clock_of_points(
     scans = [times for times in scans if times.unit_ns() == unit_ns]
     if not unit_ns or len(scans) < _FEWEST:
         return None, f"{_OTHER}; {count_of(len(scans), 'scan')} cannot tell the difference"
-    return _clock(scans, unit_ns, stamp)
+    return _clock(scans, unit_ns, options.sweep_stamp)
 
 
 _OTHER = "times of the points are of another clock than the stamps"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sst_graph.cameras import Rectification
 from sst_graph.classes import MaskEncoding, guess_mask_encoding
 from sst_graph.data.arrays import listed
-from sst_graph.data.point_times import PointClock, ScanTimes, clock_of_points
+from sst_graph.data.point_times import ScanTimes, clock_of_points
 from sst_graph.data.rectified import RectifiedSource
 from sst_graph.data.ros.bag import Bag, Topic
 from sst_graph.data.ros.camera_info import ImageGeometry, geometry_by_file, has_matrix, image_geometry
@@ -27,7 +27,7 @@ from sst_graph.data.ros.index import BagIndex, Stamped, read_index
 from sst_graph.data.ros.link_frame import LEAST_SEEN, LINK_AXES, is_link, may_be_link
 from sst_graph.data.ros.moving_frame import check_moves_along
 from sst_graph.data.ros.topics import Topics, choose_topics
-from sst_graph.data.source import Loader, SourceOptions
+from sst_graph.data.source import Loader, SourceOptions, Stamps
 from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
 from sst_graph.errors import ConfigError, DataError, count_of, printable
 from sst_graph.files.reading import path_of
@@ -48,20 +48,60 @@ _MASKS_TO_JUDGE = 8
 
 @dataclass(frozen=True, eq=False)
 class BagMessages:
-    """Scans and images of a bag, read when asked for.
+    """Messages of a bag, read when asked for.
 
     Attributes:
-        bag: where messages are read.
+        bag: where they are read.
         topics: they are read from.
-        index: of the messages.
-        size: width and height of the images [px].
-        encoding: of the masks; None without masks.
-        reading: of the clouds.
+        index: of them.
     """
 
     bag: Bag
     topics: Topics
     index: BagIndex
+
+    def read(self, stamped: Stamped, topic: Topic) -> Any:
+        """A message of a topic.
+
+        Raises:
+            DataError: the bag is damaged.
+        """
+        data = self.bag.read(stamped.message, self.topics.sensors, self.index.received_ns)
+        return self.bag.decoded(data, topic.type)
+
+    def place(self, stamped: Stamped) -> str:
+        """What a fault of a message is reported at."""
+        return f"{self.bag.path}, {stamped.message.topic} at {stamped.stamp_ns} ns"
+
+    def picture(self, k: int) -> NDArray[np.uint8]:
+        """Pixels of image k."""
+        stamped, topic = self.index.images[k], self.topics.image
+        return picture_of(self.read(stamped, topic), topic.type, self.place(stamped))
+
+    def times(self, k: int, stamps: Stamps) -> ScanTimes | None:
+        """Times of the points of scan k; stamps: which ones are those of the scans."""
+        stamped = self.index.clouds[k]
+        values = times_of(self.read(stamped, self.topics.cloud), self.place(stamped))
+        if values is None:
+            return None
+        received_ns = stamped.message.received_ns
+        # Tools that write bags anew may take the header's stamp for the time of recording, or round it.
+        is_known = stamps == "received" or abs(received_ns - stamped.stamp_ns) > 1_000
+        return ScanTimes(stamped.stamp_ns, values, received_ns if is_known else None)
+
+
+@dataclass(frozen=True, eq=False)
+class BagSensors:
+    """Scans and images of a bag.
+
+    Attributes:
+        messages: that they are made of.
+        size: width and height of the images [px].
+        encoding: of the masks; None without masks.
+        reading: of the clouds.
+    """
+
+    messages: BagMessages
     size: tuple[int, int]
     encoding: MaskEncoding | None
     reading: CloudReading
@@ -72,33 +112,28 @@ class BagMessages:
         Raises:
             DataError: the message holds what it must not, or the bag is damaged.
         """
-        stamped = self.index.clouds[k]
-        message = self._message(stamped, self.topics.cloud.type)
-        return scan_of(message, stamped.stamp_ns, _place(self.bag, stamped), self.reading)
+        messages, stamped = self.messages, self.messages.index.clouds[k]
+        message = messages.read(stamped, messages.topics.cloud)
+        return scan_of(message, stamped.stamp_ns, messages.place(stamped), self.reading)
 
     def image(self, k: int) -> CameraImage:
         """Image k of the topic, with the mask of its stamp; errors as of a scan."""
-        stamped, topic = self.index.images[k], self.topics.image
-        place = _place(self.bag, stamped)
-        pixels = picture_of(self._message(stamped, topic.type), topic.type, place)
-        check_size(pixels, self.size, place)
+        stamped, pixels = self.messages.index.images[k], self.messages.picture(k)
+        check_size(pixels, self.size, self.messages.place(stamped))
         return CameraImage(stamped.stamp_ns, self._mask(self._masks.get(stamped.stamp_ns)), pixels)
 
     @cached_property
     def _masks(self) -> dict[int, Stamped]:
         """By stamp."""
-        return {one.stamp_ns: one for one in self.index.masks}
+        return {one.stamp_ns: one for one in self.messages.index.masks}
 
     def _mask(self, stamped: Stamped | None) -> NDArray[np.uint8]:
         """Classes (h, w); where there is no mask every pixel may be anything."""
-        topic, encoding = self.topics.mask, self.encoding
+        messages, topic, encoding = self.messages, self.messages.topics.mask, self.encoding
         if stamped is None or topic is None or encoding is None:
             return np.full(self.size[::-1], SemanticClass.IGNORE, np.uint8)
-        place = _place(self.bag, stamped)
-        return mask_classes(self._message(stamped, topic.type), topic.type, encoding, self.size, place)
-
-    def _message(self, stamped: Stamped, type_name: str) -> Any:
-        return _read(self.bag, self.topics, self.index, stamped, type_name)
+        message, place = messages.read(stamped, topic), messages.place(stamped)
+        return mask_classes(message, topic.type, encoding, self.size, place)
 
 
 def is_ros(path: Path) -> bool:
@@ -159,19 +194,22 @@ def open_ros(path: Path, options: SourceOptions) -> Source:
     of_frame = check_moves_along(
         index.cloud_frame, index.image_frame, index.transforms, f"{path}, {topics.cloud.name}"
     )
-    size = _size(bag, topics, index)
+    messages = BagMessages(bag, topics, index)
+    height, width = messages.picture(0).shape[:2]
+    size = (width, height)
     geometry = _geometry(path, topics, index, size, options)
-    oTl, reason = _extrinsic(bag, topics, index, geometry)
+    fields = field_names(messages.read(index.clouds[0], topics.cloud))
+    oTl, reason = _extrinsic(messages, geometry)
     nominal = None if oTl is None else geometry.extrinsic(oTl)
     if nominal is None:
         _LOG.info("%s: no nominal extrinsic: %s", printable(path), reason)
-    clock, of_clock = _clock(bag, topics, index, options)
+    times = partial(messages.times, stamps=options.stamps)
+    clock, of_clock = clock_of_points(times, len(index.clouds), options)
     timing, has_labels = options.timing(_stamps(index.clouds)), topics.mask is not None
     reading = CloudReading(timing, options.sweep == "auto", has_labels, clock)
-    encoding = _encoding(bag, topics, index, options)
-    messages = BagMessages(bag, topics, index, size, encoding, reading)
+    sensors = BagSensors(messages, size, _encoding(messages, options), reading)
     notes = [f"camera model from {topics.info.name if topics.info else options.camera_file}"]
-    notes.append(f"fields of the clouds: {', '.join(_fields(bag, topics, index))}")
+    notes.append(f"fields of the clouds: {', '.join(fields)}")
     if index.repeated:
         notes.append(f"left out {count_of(index.repeated, 'message')} with the stamp of another")
     if topics.info is not None and index.other_infos:
@@ -188,8 +226,8 @@ def open_ros(path: Path, options: SourceOptions) -> Source:
         remarks=(of_clock,) * bool(of_clock),
         doubts=(of_frame,) * bool(of_frame),
     )
-    scans = Sensor(_stamps(index.clouds), messages.scan, _place_of(topics.cloud), topics.cloud.name)
-    images = Sensor(_stamps(index.images), messages.image, _place_of(topics.image), topics.image.name)
+    scans = Sensor(_stamps(index.clouds), sensors.scan, _place_of(topics.cloud), topics.cloud.name)
+    images = Sensor(_stamps(index.images), sensors.image, _place_of(topics.image), topics.image.name)
     drive = merged(properties, scans, images, options, path, scans_are_complete=True)
     return drive if model.is_pinhole else RectifiedSource(drive, Rectification.of(model))
 
@@ -231,17 +269,15 @@ def _geometry(
     return image_geometry(index.info, topics.image.name, size, place)
 
 
-def _extrinsic(
-    bag: Bag, topics: Topics, index: BagIndex, geometry: ImageGeometry
-) -> tuple[gtsam.Pose3 | None, str]:
+def _extrinsic(messages: BagMessages, geometry: ImageGeometry) -> tuple[gtsam.Pose3 | None, str]:
     """Pose of the LiDAR in the optical axes of the camera by the transforms, or None, and why."""
-    oTl, reason = index.transforms.pose(index.image_frame, index.cloud_frame)
-    frame = index.image_frame
+    index, frame = messages.index, messages.index.image_frame
+    oTl, reason = index.transforms.pose(frame, index.cloud_frame)
     if oTl is None or not may_be_link(frame, oTl):
         return oTl, reason
-    for place in evenly_spread(index.clouds, _CLOUDS_TO_JUDGE):
-        message = _read(bag, topics, index, place, topics.cloud.type)
-        points = cloud_of(message, place.stamp_ns, _place(bag, place), times=False).points
+    for one in evenly_spread(index.clouds, _CLOUDS_TO_JUDGE):
+        message = messages.read(one, messages.topics.cloud)
+        points = cloud_of(message, one.stamp_ns, messages.place(one), times=False).points
         # A LiDAR that starts up sends clouds that are all but empty.
         if len(points) >= LEAST_SEEN:
             if is_link(frame, oTl, points, geometry.model):
@@ -251,64 +287,17 @@ def _extrinsic(
     return oTl, reason
 
 
-def _size(bag: Bag, topics: Topics, index: BagIndex) -> tuple[int, int]:
-    """Width and height of the first image [px]."""
-    first, type_name = index.images[0], topics.image.type
-    height, width = picture_of(
-        _read(bag, topics, index, first, type_name), type_name, _place(bag, first)
-    ).shape[:2]
-    return width, height
-
-
-def _fields(bag: Bag, topics: Topics, index: BagIndex) -> tuple[str, ...]:
-    """Names of what the first cloud holds for each point."""
-    return field_names(_read(bag, topics, index, index.clouds[0], topics.cloud.type))
-
-
-def _clock(
-    bag: Bag, topics: Topics, index: BagIndex, options: SourceOptions
-) -> tuple[PointClock | None, str]:
-    """The clock of the points' times, where it is not that of the stamps, and a sentence on it."""
-    if options.sweep != "auto":
-        return None, ""
-
-    def read(k: int) -> ScanTimes | None:
-        first = index.clouds[k]
-        try:
-            message = _read(bag, topics, index, first, topics.cloud.type)
-            values = times_of(message, _place(bag, first))
-        except DataError:  # which the scan will raise when it is read
-            return None
-        if values is None:
-            return None
-        received_ns = first.message.received_ns
-        # Tools that write bags anew may take the header's stamp for the time of recording, or round it.
-        is_known = options.stamps == "received" or abs(received_ns - first.stamp_ns) > 1_000
-        return ScanTimes(first.stamp_ns, values, received_ns if is_known else None)
-
-    return clock_of_points(read, len(index.clouds), options.sweep_stamp)
-
-
-def _encoding(bag: Bag, topics: Topics, index: BagIndex, options: SourceOptions) -> MaskEncoding | None:
-    mask = topics.mask
+def _encoding(messages: BagMessages, options: SourceOptions) -> MaskEncoding | None:
+    mask = messages.topics.mask
     if mask is None:
         return None
     if options.label_encoding != "auto":
         return MaskEncoding(options.label_encoding)
     masks = (
-        mask_of(_read(bag, topics, index, place, mask.type), mask.type, _place(bag, place))
-        for place in evenly_spread(index.masks, _MASKS_TO_JUDGE)
+        mask_of(messages.read(one, mask), mask.type, messages.place(one))
+        for one in evenly_spread(messages.index.masks, _MASKS_TO_JUDGE)
     )
-    return guess_mask_encoding(masks, f"{bag.path}, {mask.name}")
-
-
-def _read(bag: Bag, topics: Topics, index: BagIndex, place: Stamped, type_name: str) -> Any:
-    data = bag.read(place.message, topics.sensors, index.received_ns)
-    return bag.decoded(data, type_name)
-
-
-def _place(bag: Bag, place: Stamped) -> str:
-    return f"{bag.path}, {place.message.topic} at {place.stamp_ns} ns"
+    return guess_mask_encoding(masks, f"{messages.bag.path}, {mask.name}")
 
 
 ROS_LOADER = Loader(recognizes=is_ros, open=open_ros, layout=LAYOUT, unused=("sequence", "cloud"))

@@ -200,9 +200,9 @@ class ChangeDetector:
         past the threshold, while the others in it would have shown what it shows, is wrong itself: it is left
         out.
         """
-        pairs = self.matcher.pairs_at(estimate.point, sorted(estimate.scans), _KERNEL)
-        out = set(moving)
-        scores = {scan: self._scores({scan: pair}, estimate, out) for scan, pair in pairs.items()}
+        at, linearized, out = estimate.point, self.matcher.linearized, set(moving)
+        pairs = self.matcher.pairs_at(at, sorted(estimate.scans), _KERNEL)
+        scores = {scan: linearized({scan: pair}, at, out) for scan, pair in pairs.items()}
         while True:
             value, scans = self._largest_of_parts(scores, estimate)
             if value <= threshold:
@@ -214,13 +214,7 @@ class ChangeDetector:
             out.add(odd)
             for scan, pair in pairs.items():
                 if odd in self.matcher.tracks_of({scan: pair}):
-                    scores[scan] = self._scores({scan: pair}, estimate, out)
-
-    def _scores(
-        self, pairs: Mapping[int, PairMatches], estimate: ComparedEstimate, out: Collection[int]
-    ) -> list[LinearizedPair]:
-        """Scores of frames at an estimate, without some objects; none where all matches are left out."""
-        return self.matcher.linearized(pairs, estimate.point, out)
+                    scores[scan] = linearized({scan: pair}, at, out)
 
     def _largest_of_parts(
         self, scores: Mapping[int, Sequence[LinearizedPair]], estimate: ComparedEstimate
@@ -255,7 +249,7 @@ class ChangeDetector:
         tried = steps(estimate.point.cTl, DETECTABLE_TURN_RAD, DETECTABLE_OFFSET_S)
 
         def compared(*without: int) -> FrameScores | None:
-            scores = self._scores(pairs, estimate, {*without, *out})
+            scores = self.matcher.linearized(pairs, estimate.point, {*without, *out})
             return self.statistic.compare(scores, estimate) if scores else None
 
         whole = compared()

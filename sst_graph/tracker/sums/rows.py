@@ -8,13 +8,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
 from sst_graph.association.edge_matching import MatchConfig
 from sst_graph.assumptions.model import Scene
-from sst_graph.factors.alignment import Alignment
+from sst_graph.factors.matches import Alignment, joined
 from sst_graph.factors.reprojection import ImageGroups, weigh
 from sst_graph.graph.matching import PairMatches
 from sst_graph.graph.nuisances import columns_of_jacobian
@@ -120,7 +119,7 @@ def _of_class(pairs: Sequence[PairAt], c: SemanticClass) -> list[Rows]:
     """The rows of the matches of one class in each of some pairs."""
     point, held = pairs[0].point, pairs[0].columns.held
     assumptions = [name for name in held if name not in EDGE_ERRORS]
-    alignment = _joined([one.pair.matches[c].alignment for one in pairs])
+    alignment = joined([one.pair.matches[c].alignment for one in pairs])
     counts = [len(one.pair.matches[c]) for one in pairs]
     columns = [one.bias_columns(c) for one in pairs]
     biases = np.concatenate([one.scalars[own - 7] for one, own in zip(pairs, columns, strict=True)])
@@ -178,22 +177,3 @@ def _scene(pairs: Sequence[PairAt], counts: Sequence[int]) -> Scene:
     l_twists = np.repeat([scene.l_twist for scene in scenes], counts, axis=0)
     images_s = np.repeat([scene.image_s for scene in scenes], counts)
     return replace(scenes[0], l_twist=l_twists, image_s=images_s)
-
-
-def _joined(alignments: Sequence[Alignment]) -> Alignment:
-    """Silhouettes of one class in some images as one alignment."""
-    counts = [len(each) for each in alignments]
-    names = ("lPs", "base_taus_s", "pixels", "sigmas_px", "normals", "weights")
-    rows: dict[str, Any] = {
-        name: np.concatenate([getattr(each, name) for each in alignments]) for name in names
-    }
-    rows["c_acceleration"] = np.repeat([each.c_acceleration for each in alignments], counts, axis=0)
-    # Objects without a velocity stand, and images that were not rectified are not stretched.
-    for name, usual in (("l_velocities", np.zeros(3)), ("stretches", np.ones(()))):
-        own = [getattr(each, name) for each in alignments]
-        if any(each is not None for each in own):
-            parts = zip(own, counts, strict=True)
-            rows[name] = np.concatenate(
-                [np.full((n, *usual.shape), usual) if each is None else each for each, n in parts]
-            )
-    return replace(alignments[0], **rows)

@@ -68,24 +68,37 @@ class RunningSums:
             columns: of the pair's unknowns, and of what it holds if the sums do, among those of these.
             by_object: keep its matches object by object, too.
         """
-        n = self.size + self.held
-        both = self.scores, pair.scores.columns(slice(len(columns)))
+        own = replace(pair, scores=pair.scores.columns(slice(len(columns))))
+        vars(self).update(vars(self.with_pairs([own], [columns])))
         self.last_seen.update(dict.fromkeys(pair.scores.sides.tolist(), scan))
         closed = [side for side, last in self.last_seen.items() if last < scan - OBJECT_MEMORY]
         for side in closed:
             del self.last_seen[side]
-        self.scores = total(n, both, (np.arange(n), columns)).without_sides(closed)
+        self.scores = self.scores.without_sides(closed)
         self.recent.append(pair.residuals)
         if by_object and pair.objects is not None:
             self.objects.add(pair.objects)
-        self.weight, self.curvature = self.weight + pair.weight, self.curvature + pair.curvature
-        self.shifts = self.shifts + pair.shifts
-        self.by_shifts = self.by_shifts + _squares([pair], [columns], n)
 
-    def weight_curvature_ratio(self, window: Sequence[LinearizedPair] = ()) -> float:
+    def with_pairs(self, pairs: Sequence[LinearizedPair], columns: Sequence[IntArray]) -> RunningSums:
+        """With the scores of pairs of the window, which stay open.
+
+        Args:
+            columns: of the unknowns of each pair and of what it holds, among those of these.
+        """
+        n = self.size + self.held
+        return replace(
+            self,
+            scores=total(n, [self.scores, *(pair.scores for pair in pairs)], [np.arange(n), *columns]),
+            weight=self.weight + sum(pair.weight for pair in pairs),
+            curvature=self.curvature + sum(pair.curvature for pair in pairs),
+            shifts=sum((pair.shifts for pair in pairs), self.shifts),
+            by_shifts=self.by_shifts + _squares(pairs, columns, n),
+        )
+
+    @property
+    def weight_curvature_ratio(self) -> float:
         """Mean robust weight over mean curvature, of all matches."""
-        curvature = self.curvature + sum(pair.curvature for pair in window)
-        return curvature_ratio(self.weight + sum(pair.weight for pair in window), curvature)
+        return curvature_ratio(self.weight, self.curvature)
 
     def grow(self, n: int) -> None:
         """Make room for further unknowns, n in all."""
@@ -97,20 +110,13 @@ class RunningSums:
         self.by_shifts = T @ self.by_shifts @ T.T
         self.objects.transform(T[: len(T) - self.held, : T.shape[1] - self.held])
 
-    def carried(
-        self, pairs: Sequence[LinearizedPair], columns: Sequence[IntArray], T: FloatArray
-    ) -> RunningSums:
-        """With further pairs, and then through a random walk; the matches object by object stay as they are.
+    def carried(self, T: FloatArray) -> RunningSums:
+        """Through a random walk; the matches object by object stay as they are.
 
         Args:
-            pairs, columns: as those of :meth:`excess`.
             T: (n, n) of :meth:`Gaussian.transition`, held parameters included.
         """
-        n = self.size + self.held
-        scores = total(n, [self.scores, *(pair.scores for pair in pairs)], [np.arange(n), *columns])
-        by_shifts = T @ (self.by_shifts + _squares(pairs, columns, n)) @ T.T
-        shifts = sum((pair.shifts for pair in pairs), self.shifts)
-        return replace(self, scores=scores.transformed(T), by_shifts=by_shifts, shifts=shifts)
+        return replace(self, scores=self.scores.transformed(T), by_shifts=T @ self.by_shifts @ T.T)
 
     def copy(self) -> RunningSums:
         recent = deque(self.recent, self.recent.maxlen)
@@ -120,44 +126,23 @@ class RunningSums:
         """The error model by the latest frames and those of the window."""
         return fit_error_model(SideResiduals.joined([*self.recent, *(pair.residuals for pair in window)]))
 
-    def excess(
-        self,
-        window: Sequence[LinearizedPair],
-        columns: Sequence[IntArray],
-        model: ErrorModel,
-        with_held: bool = False,
-    ) -> FloatArray:
+    def excess(self, model: ErrorModel, with_held: bool = False) -> FloatArray:
         """(n, n) variance of the score beyond that of independent matches.
 
         Args:
-            window: pairs beside those added.
-            columns: of their unknowns and of what they hold.
             with_held: over the held parameters, too.
         """
-        n = self.size + self.held
-        every = total(n, [self.scores, *(pair.scores for pair in window)], [np.arange(n), *columns])
-        return (every if with_held else every.columns(slice(self.size))).excess(model)
+        return (self.scores if with_held else self.scores.columns(slice(self.size))).excess(model)
 
-    def shift_variances(self, window: Sequence[LinearizedPair]) -> FloatArray:
-        """(3,) variances of the shifts of pictures [px^2, px^2] and of their stamps [s^2] over the images.
+    @property
+    def shift_variances(self) -> FloatArray:
+        """(3,) variances of the shifts of pictures [px^2, px^2] and of their stamps [s^2] over the images."""
+        return shift_variances(self.shifts)
 
-        Args:
-            window: pairs beside those added.
-        """
-        return shift_variances(sum((pair.shifts for pair in window), self.shifts))
-
-    def shift_excess(
-        self, window: Sequence[LinearizedPair], columns: Sequence[IntArray]
-    ) -> tuple[FloatArray, FloatArray]:
-        """:meth:`shift_variances`, and (3, n, n) what each adds to the variance of the score, over the held
-        parameters, too.
-
-        Args:
-            window, columns: as of :meth:`excess`.
-        """
-        variances = self.shift_variances(window)
-        squares = self.by_shifts + _squares(window, columns, self.size + self.held)
-        return variances, variances[:, None, None] * squares
+    @property
+    def shift_excess(self) -> FloatArray:
+        """(3, n, n) what each adds to the variance of the score, over the held parameters, too."""
+        return self.shift_variances[:, None, None] * self.by_shifts
 
 
 def _squares(pairs: Sequence[LinearizedPair], columns: Sequence[IntArray], n: int) -> FloatArray:

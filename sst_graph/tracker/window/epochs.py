@@ -107,8 +107,8 @@ class EpochSums:
             shift_variances: (3,) of the shifts of pictures and their stamps, from image to image.
         """
         H = self.information.information
-        variance = H + self.sums.excess([], [], model)
-        excess = composed(variance, None, self.sums.weight_curvature_ratio()) - H
+        variance = H + self.sums.excess(model)
+        excess = composed(variance, None, self.sums.weight_curvature_ratio) - H
         excess = excess + np.tensordot(shift_variances, self.sums.by_shifts, axes=1)
         information, T = self.information.without(self.information.point.tracks)
         return RetiredEpoch(start_ns, information, T @ excess @ T.T)

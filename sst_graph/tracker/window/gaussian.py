@@ -185,12 +185,7 @@ class Gaussian:
 
         What is held is what this one holds, or nothing.
         """
-        other = other.at(self.point) if self.held else other.without_held().at(self.point)
-        columns = self.point.columns(other.point.tracks, other.held)
-        information, vector = self.information.copy(), self.vector.copy()
-        information[np.ix_(columns, columns)] += other.information
-        vector[columns] += other.vector
-        return Gaussian(self.point, information, vector)
+        return Gaussian(self.point, self.information_with([other]), self.vector_with([other]))
 
     def information_with(self, others: Sequence[Gaussian]) -> FloatArray:
         """(n, n) information of this and others, whose objects are all known here."""

@@ -246,7 +246,7 @@ class WindowMatcher:
         motion = self._motion[1]
         if self.graph.object_bias_sigma_px == 0.0:
             return motion
-        posed = replace(motion, poses=self.window.poses_of(numbers))
+        posed = replace(motion, poses=[self.window.poses[number] for number in numbers])
         return posed.with_objects(*self.window.objects_of(numbers))
 
 

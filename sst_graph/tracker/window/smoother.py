@@ -338,66 +338,42 @@ class WindowSmoother:
             total = replace(total, information=total.information_with(seen))
         return total.information
 
-    def covariance(self, information: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def covariance(self, information: FloatArray, sums: RunningSums) -> tuple[FloatArray, FloatArray]:
         """(n, n) cluster-robust covariance of the unknowns of ``past``, and that of independent matches.
 
         Args:
             information: of :meth:`information`.
+            sums: of :meth:`sums_on_last_epoch`.
 
         Raises:
             EstimationError: a direction without any information.
         """
         n = self.past.point.size
         naive = inverted(information[:n, :n])
-        robust = naive + naive @ self.excess() @ naive
+        robust = naive + naive @ sums.excess(self.model) @ naive
         spread = None
         if not self.drift.enabled:
             found = [e.linear.objects for e in self.entries.values() if e.linear.objects is not None]
             spread = self.sums.objects.spread(found, naive, self.past.at(self.point).point)
-        robust = composed(robust, spread, self.weight_curvature_ratio)
+        robust = composed(robust, spread, sums.weight_curvature_ratio)
         return 0.5 * (robust + robust.T), naive
 
-    def excess(self, with_held: bool = False) -> FloatArray:
-        """(n, n) variance of the score of past and window beyond that of independent matches.
-
-        Args:
-            with_held: over the held parameters of ``past``, too.
-        """
-        sums, window, columns = self._sums_of_last_epoch()
-        return sums.excess(window, columns, self.model, with_held)
-
-    def shift_variances(self) -> FloatArray:
-        """(3,) :meth:`RunningSums.shift_variances` over past and window."""
-        return self.sums.shift_variances([entry.linear for entry in self.entries.values()])
-
-    def shift_excess(self) -> tuple[FloatArray, FloatArray]:
-        """The same, and (3, n, n) what each adds to the variance of the score
-        (:meth:`RunningSums.shift_excess`)."""
-        sums, window, columns = self._sums_of_last_epoch()
-        return sums.shift_excess(window, columns)
-
-    def _sums_of_last_epoch(self) -> tuple[RunningSums, list[LinearizedPair], list[IntArray]]:
-        """The sums over all epochs but the last, carried to it by the random walks; the pairs of the
-        window that the last one has, and the columns of each in ``past``."""
-        sums, total = self.sums, self.past
+    def sums_on_last_epoch(self) -> RunningSums:
+        """The sums over past and window, carried to the last epoch by the random walks."""
+        sums, total = self.sums.with_pairs(*self._pairs_of(self.epochs[0])), self.past
         for old, new in pairwise(self.epochs):
-            window, columns = self._pairs_of(old)
+            window, _ = self._pairs_of(old)
             total = replace(total, information=total.information_with([pair.information for pair in window]))
             variances = self.walk(old, new)
-            sums = sums.carried(window, columns, total.transition(variances))
+            sums = sums.carried(total.transition(variances)).with_pairs(*self._pairs_of(new))
             total = total.drifted(variances)
-        return (sums, *self._pairs_of(self.epochs[-1]))
+        return sums
 
     def _pairs_of(self, epoch: Epoch) -> tuple[list[LinearizedPair], list[IntArray]]:
         """The pairs of the window that see an epoch's calibration, and the columns of each in ``past``."""
         point = self.past.point
         pairs = [entry.linear for entry in self.entries.values() if entry.epoch == epoch.number]
         return pairs, [point.columns(pair.information.point.tracks, self.past.held) for pair in pairs]
-
-    @property
-    def weight_curvature_ratio(self) -> float:
-        """Mean robust weight over mean curvature, of all matches of past and window."""
-        return self.sums.weight_curvature_ratio([entry.linear for entry in self.entries.values()])
 
     @property
     def objects(self) -> int:
@@ -408,7 +384,7 @@ class WindowSmoother:
 
     def live_epochs(self) -> list[RetiredEpoch]:
         """Epochs of the window, as if they retired now."""
-        found, shift_variances = [], self.shift_variances()
+        found, shift_variances = [], self.sums_on_last_epoch().shift_variances
         for i, epoch in enumerate(self.epochs):
             sums = self.epoch_sums.copy() if i == 0 else EpochSums.empty(self.past.point)
             for scan, entry in self.entries.items():

@@ -224,8 +224,8 @@ class SmootherUpdate:
         smoother = self._smoother
         old, new = self.epochs[0], self.epochs[1]
         variances = smoother.walk(old, new)
-        epoch = self.epoch_sums.retired(old.start_ns, smoother.model, smoother.shift_variances())
-        self.retired.append(epoch)
+        shift_variances = smoother.sums_on_last_epoch().shift_variances
+        self.retired.append(self.epoch_sums.retired(old.start_ns, smoother.model, shift_variances))
         self.epoch_sums = EpochSums.empty(self.past.point)
         self.sums.transform(self.past.transition(variances))
         gaussians = (self.past, self.observed, self.static)

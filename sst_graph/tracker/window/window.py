@@ -215,10 +215,6 @@ class Window:
             dynamic.update({(position, c, n): one for (c, n), one in found.items()})
         return tracks, dynamic
 
-    def poses_of(self, numbers: Sequence[int]) -> list[gtsam.Pose3]:
-        """Poses of some scans, in the world."""
-        return [self.poses[number] for number in numbers]
-
     def add_image(self, features: ImageFeatures, pair: ImagePair | None = None) -> None:
         """Keep an image, with a number of its own, in the order of stamps.
 

@@ -23,6 +23,7 @@ from sst_graph.data.arrays import read_labels
 from sst_graph.data.images import read_mask
 from sst_graph.data.info.facts import facts_of
 from sst_graph.data.point_times import PointClock, ScanTimes, clock_of_points, seconds_after_stamp
+from sst_graph.data.source import SourceOptions
 from sst_graph.errors import DataError
 from sst_graph.simulator import SimulationConfig
 
@@ -197,7 +198,7 @@ SWEEP = np.linspace(0.0, 0.1, 200)
 
 def clock(stamps_ns: NDArray[np.int64], values: list[NDArray[Any]]) -> tuple[PointClock | None, str]:
     scans = [ScanTimes(int(stamp), of_scan) for stamp, of_scan in zip(stamps_ns, values, strict=True)]
-    return clock_of_points(scans.__getitem__, len(scans), "forward")
+    return clock_of_points(scans.__getitem__, len(scans), SourceOptions())
 
 
 @pytest.mark.parametrize(
@@ -282,7 +283,7 @@ def test_when_messages_arrive_tells_what_their_stamps_name(after_s: list[float |
         ScanTimes(stamp, stamp * 1e-9 + 37.0 + SWEEP, None if after is None else stamp + round(after * 1e9))
         for stamp, after in zip(stamps_ns, after_s, strict=True)
     ]
-    assert f"as the {named} of" in clock_of_points(scans.__getitem__, len(scans), "forward")[1]
+    assert f"as the {named} of" in clock_of_points(scans.__getitem__, len(scans), SourceOptions())[1]
 
 
 @pytest.mark.parametrize("arrives_s", [0.0, 2e-7], ids=["equal", "rounded"])
