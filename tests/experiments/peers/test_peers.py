@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import shutil
 from pathlib import Path
 
 import gtsam
@@ -134,6 +135,23 @@ def test_without_intensities_they_refuse() -> None:
     for name in ("nid", "mutual-information"):
         with pytest.raises(EstimationError, match="no intensities"):
             PEERS[name].solve(dataclasses.replace(problem(1.0), frames=bare), off(1.0))
+
+
+def test_without_masks_their_consistency_refuses() -> None:
+    bare = [dataclasses.replace(f, mask=np.zeros_like(f.mask), instances=None) for f in street()[2]]
+    with pytest.raises(EstimationError, match="no masks"):
+        solve_mask_consistency(dataclasses.replace(problem(1.0), frames=bare), off(1.0))
+
+
+def test_what_needs_labels_is_not_run_on_a_drive_without(
+    kitti_drive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.rmtree(kitti_drive / "labels")
+    small = ["--streets", "0", "--methods", "joint,semalign", "--set", "ranges_deg=[1]"]
+    assert main(["experiment", "peers", "--data", str(kitti_drive.parents[1]), *small]) == 0
+    told = capsys.readouterr().out
+    assert "| joint | the data hold no labels of points |" in told
+    assert "| semalign | the data hold no labels of points |" in told
 
 
 def test_an_edge_decays_by_gamma_a_pixel() -> None:
