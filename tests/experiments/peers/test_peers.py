@@ -214,6 +214,19 @@ def test_the_command_writes_table_and_figure(tmp_path: Path, capsys: pytest.Capt
     assert capsys.readouterr().out == text and svg.read_bytes() == drawn
 
 
+def test_a_figure_that_cannot_be_written_costs_no_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, file = tmp_path / "out" / "peers.md", tmp_path / "file"
+    file.touch()
+    for figure, words in ((file / "peers.svg", "file"), (out, "--out and the figure: found the same file")):
+        command = ["experiment", "peers", "--set", f'figure="{figure}"', "--out", str(out)]
+        assert main(command) == 2
+        told = capsys.readouterr().err
+        assert words in told and "runs:" not in told
+    assert not list(tmp_path.glob("out/peers*"))
+
+
 def test_wrong_settings_are_a_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["experiment", "peers", "--methods", "guess"]) == 2
     assert "levinson-thrun" in capsys.readouterr().err
