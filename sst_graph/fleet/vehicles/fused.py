@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from sst_graph.config import expect_settings
 from sst_graph.covariance.observability import ObservabilityConfig, weak_directions
-from sst_graph.errors import EstimationError
+from sst_graph.errors import EstimationError, count_of
 from sst_graph.factors.arguments import checked_type
 from sst_graph.factors.errors import FactorError
 from sst_graph.files.strict_json import strict_json
@@ -97,8 +97,8 @@ class Vehicle:
         parts += [f"by all drives, {one.sentence}" for one in self.weak[:1]]
         if len(self.cameras) > 1:
             parts.append(
-                f"its drives name {len(self.cameras)} cameras ({', '.join(self.cameras)}), which are fused "
-                "as one: make a vehicle of each, unless all of them are names of one"
+                f"its drives name {count_of(len(self.cameras), 'camera')} ({', '.join(self.cameras)}), which "
+                "are fused as one: make a vehicle of each, unless all of them are names of one"
             )
         if self.calibration is None:
             parts.append("no drive of it has a result that counts")
