@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import cache, partial
+from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sst_graph.cli.messages import complain
-from sst_graph.data.frame_parts import image_at, image_positions, scan_at, scan_positions
 from sst_graph.data.info.methods import WITHOUT_EDGES
-from sst_graph.errors import ConfigError, DataError
-from sst_graph.sampling import evenly_spread
-from sst_graph.types import CameraImage, Scan, SemanticClass, Source
+from sst_graph.errors import ConfigError
+from sst_graph.types import SemanticClass, Source
 
 if TYPE_CHECKING:
     from sst_graph.segmentation import ImageSegmenter, Labelling, LabelStore, ScanSegmenter
 
 LABEL_OPTIONS = ("image_model", "lidar_model", "labels")
 """Options that say what labels a drive."""
-METHODS_BY_LABELS = ("joint", "paper", "static", "semalign")
-"""Methods that align nothing without labels of both sensors."""
 ALIGNABLE = tuple(
     label
     for label in SemanticClass
@@ -29,8 +25,6 @@ ALIGNABLE = tuple(
 """Classes that ``--classes`` takes."""
 _OF_OBJECTS = tuple(label for label in ALIGNABLE if label not in WITHOUT_EDGES)
 """Classes of objects: they stand before something else, and so have edges in a scan."""
-_FIRST = 8
-"""Scans, or images, that are looked at before all others."""
 
 
 def labelled(source: Source, options: Mapping[str, Any]) -> Source:
@@ -90,52 +84,6 @@ def expect_alignable(segmenters: Sequence[ImageSegmenter | ScanSegmenter | None]
                 f"expected one of {', '.join(one.name.lower() for one in _OF_OBJECTS)}"
             )
         complain(f"note: {segmenter.name}: knows no vehicles: calibrate with --classes {','.join(known)}")
-
-
-def require_labels(cameras: Sequence[Sequence[Source]], method: str) -> None:
-    """Require labels on each side of one camera at least, for a method that aligns nothing else; those by
-    networks are made later.
-
-    Args:
-        cameras: drives of each.
-
-    Raises:
-        DataError: no scan of any drive has labels, or no image, for every camera; or a frame that cannot be
-            read.
-    """
-    found = []
-    for sources in cameras:
-        found.append(_missing(sources, method))
-        if not found[-1]:
-            return
-    raise DataError(
-        ", ".join(source.name for source in cameras[0]),
-        f"no {' and no '.join(found[0])}",
-        f"both for method {method}: say where they are, make them by networks, or take --method edges",
-    )
-
-
-def _missing(sources: Sequence[Source], method: str) -> list[str]:
-    """What labels a method needs and no drive has."""
-    if method not in METHODS_BY_LABELS or any(getattr(one, "labelling", None) is not None for one in sources):
-        return []
-    missing = []
-    if not any(_any_labels(scan_positions(one), partial(scan_at, one)) for one in sources):
-        missing.append("labels of points")
-    if not any(_any_labels(image_positions(one), partial(image_at, one)) for one in sources):
-        missing.append("semantic masks of images")
-    return missing
-
-
-def _any_labels(positions: Sequence[int], read: Callable[[int], Scan | CameraImage | None]) -> bool:
-    """Whether a scan or image has labels; some that are spread over the drive are looked at first."""
-    order = dict.fromkeys((*evenly_spread(positions, _FIRST), *positions))
-    measured = (read(position) for position in order)
-    return any(one is not None and _has_labels(one) for one in measured)
-
-
-def _has_labels(one: Scan | CameraImage) -> bool:
-    return one.has_labels if isinstance(one, Scan) else one.has_mask
 
 
 def store_to_fill(folder: Path | None) -> LabelStore:

@@ -15,13 +15,14 @@ from sst_graph.batch import CalibrationConfig
 from sst_graph.batch.by_edges.choice import choice_for_cameras
 from sst_graph.cli import EXIT_NOT_TRUSTED
 from sst_graph.cli.inputs import calibration_settings, open_drives, starting_point
-from sst_graph.cli.labels import check_classes, require_labels
+from sst_graph.cli.labels import check_classes
 from sst_graph.cli.messages import complain, mention, say
 from sst_graph.cli.output_places import check_apart
 from sst_graph.cli.outputs import CALIBRATION, comparison, result_numbers, why_not_ok, write_calibration
 from sst_graph.cli.progress import ProgressBar
 from sst_graph.cli.reading import options_of, warn_of_other_pairs, with_image_topic
 from sst_graph.cli.video import video_of, videos_beside
+from sst_graph.data.info.needed_labels import require_labels
 from sst_graph.errors import ConfigError, count_of
 from sst_graph.files import atomic_directory
 from sst_graph.files.strict_json import strict_json

@@ -18,7 +18,7 @@ from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import Progress
 from sst_graph.errors import ConfigError, count_of
 from sst_graph.experiments.markdown import NONE, median, median_worst, status_counts, table
-from sst_graph.experiments.starts import drive_of, truth_of
+from sst_graph.experiments.starts import drive_of, expect_labels, truth_of
 from sst_graph.experiments.tasks.resumable import Work, rows_of
 from sst_graph.metrics import calibration_errors
 from sst_graph.simulator import SimulationConfig
@@ -143,12 +143,13 @@ def _runs_of_drive(task: Task) -> list[BasinRun]:
     """Every start of every search on one.
 
     Raises:
-        DataError: the drive cannot be used.
+        DataError: the drive cannot be used, or has no labels.
         ConfigError: it brings no reference calibration.
     """
     config = task.config
     source = drive_of(task.place, task.number, config)
     truth = truth_of(source)
+    expect_labels(source, (config.calibration.method,))
     drives = prepare_drives([source], config.calibration)
     found = []
     for search_deg, search_m, starts in zip(

@@ -44,58 +44,58 @@ class Experiment:
 
 EXPERIMENTS: Mapping[str, Experiment] = {
     "accuracy": Experiment(
-        "accuracy, failures and consistency of the joint method, scenario by scenario",
+        "errors, failures and NEES of the joint method, by scenario",
         accuracy.AccuracyConfig(),
         accuracy.run,
     ),
     "assumptions": Experiment(
-        "assumptions broken on purpose: which are found, and what the others do to the result",
+        "assumptions broken on purpose: found or not, errors left",
         assumptions.AssumptionTableConfig(),
         assumptions.run,
     ),
     "basin": Experiment(
-        "starts over the whole sphere of rotations: failures and silent failures, with their bounds",
+        "starts over the whole sphere: failures, silent ones, bounds",
         basin.BasinConfig(),
         basin.run,
     ),
     "consistency": Experiment(
-        "NEES and coverage of the covariance over many short simulated drives",
+        "NEES and coverage over many short simulated drives",
         consistency.ConsistencyConfig(),
         consistency.run,
     ),
     "drives": Experiment(
-        "real drives from many wrong starts: one result, and its distance from the reference",
+        "real drives from wrong starts: spread, distance to reference",
         drives.DrivesConfig(),
         drives.run,
     ),
     "fit": Experiment(
-        "share of boundary points close to their contour: right calibrations against turned ones",
+        "boundary points near contours: right and turned poses",
         fit.FitTableConfig(),
         fit.run,
     ),
     "motion": Experiment(
-        "what motion alone determines on simulated streets, and what it adds to the joint method",
+        "what motion alone determines, and adds to the joint method",
         motion.MotionTableConfig(),
         motion.run,
     ),
     "peers": Experiment(
-        "other methods, re-implemented, beside ours from the same starts: error, failures, time, memory",
+        "other methods, re-implemented, and ours from the same starts",
         peer_runs.PeersConfig(),
         peer_table.run,
     ),
     "rigs": Experiment(
-        "several cameras on one LiDAR: errors, joint NEES, and what a known pose between cameras adds",
+        "several cameras on one LiDAR, with and without known poses",
         rigs.RigTableConfig(),
         rigs.run,
     ),
     "slam": Experiment(
-        "SLAM and calibration in one graph against either alone, on simulated streets",
+        "SLAM and calibration in one graph against either alone",
         slam.SlamConfig(),
         slam.run,
     ),
     **{name: Experiment(one.summary, one.config, one.run, one) for name, one in TABLES.items()},
     "windows": Experiment(
-        "real drives cut into windows: the spread of the results against the claimed sigmas",
+        "real drives in windows: spread against the claimed sigmas",
         windows.WindowsConfig(),
         windows.run,
     ),

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 from typing import Any
 
 import gtsam
 import numpy as np
 
 from sst_graph.data import open_source
-from sst_graph.errors import ConfigError
+from sst_graph.data.info.needed_labels import missing_labels
+from sst_graph.errors import ConfigError, DataError
 from sst_graph.metrics import CalibrationErrors, calibration_errors
 from sst_graph.result import CalibrationResult
 from sst_graph.simulator import simulate
@@ -25,6 +27,18 @@ def truth_of(source: Source) -> GroundTruth:
     if source.truth is None:
         raise ConfigError(f"{source.name}: found no reference calibration, expected one")
     return source.truth
+
+
+def expect_labels(source: Source, methods: Iterable[str]) -> None:
+    """Require the labels that methods need: without them every run would count as a failure of the method.
+
+    Raises:
+        DataError: a method lacks them, or a frame cannot be read.
+    """
+    for method in methods:
+        if missing := missing_labels([source], method):
+            expected = f"both for method {method}, beside the drive (docs/reference/formats.md)"
+            raise DataError(source.name, f"no {' and no '.join(missing)}", expected)
 
 
 def start_near(cTl: gtsam.Pose3, half_deg: float, half_m: float, rng: np.random.Generator) -> gtsam.Pose3:

@@ -213,10 +213,10 @@ def _of_ending(job: Job, ending: Ending) -> Record:
     """The record of a process that left no result."""
     said = next((line for line in reversed(ending.log) if line.startswith(_SAID_BY_IT)), "")
     said = said.removeprefix(_SAID_BY_IT).removeprefix("error: ")
-    gigabytes = ending.peak_bytes / 2**30
+    gigabytes, limit_gb = ending.peak_bytes / 2**30, (job.limits.memory_bytes or 0) / 2**30
     status: Status = "crash"
     if ending.limit == "memory":
-        status, reason = "memory_limit", f"took {gigabytes:.2f} GB of memory"
+        status, reason = "memory_limit", f"took {gigabytes:.2f} GB of memory, more than {limit_gb:g} GB"
     elif ending.limit == "time":
         status, reason = "time_limit", f"took more than {job.limits.wall_s:g} s"
     elif ending.code == _EXIT_BAD_INPUT and said:

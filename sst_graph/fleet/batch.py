@@ -44,7 +44,8 @@ VERSION = 1
 LOCK = ".sst-graph-batch.lock"
 VEHICLES = "vehicles"
 
-_NAME_FILES, _NAME_NETWORKS = ("--config", "--init"), ("--image-model", "--lidar-model")
+_NAME_FILES = ("--config", "--init", "--camera-file")
+_NAME_NETWORKS = ("--image-model", "--lidar-model")
 _OPTION_FILE = FileKind("a file that an option names", 2**36)
 
 

@@ -278,7 +278,10 @@ def _check_names(drives: Sequence[ListedDrive]) -> None:
     names = Counter(drive.name for drive in drives)
     for name, count in names.items():
         if count > 1:
-            first, second = [drive.place.url for drive in drives if drive.name == name][:2]
+            same = [drive.place for drive in drives if drive.name == name]
+            if len({place.whole() for place in same}) < count:
+                raise ConfigError(f"{same[0]}: found the drive {name} twice, expected each drive once")
+            first, second = same[:2]
             raise ConfigError(
                 f"{first} and {second}: found two drives named {name}, expected names that differ "
                 "(--name-parts 2 takes the folder above into the name; a list in CSV has a column name)"

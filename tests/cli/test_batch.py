@@ -143,7 +143,7 @@ def test_limits_are_recorded_with_what_was_taken(drives: Path, tmp_path: Path) -
     assert main(["batch", *one, "--out", str(tmp_path / "a"), "--memory-limit", "0.04"]) == 3
     assert main(["batch", *one, "--out", str(tmp_path / "b"), "--time-limit", "0.2"]) == 3
     memory, wall = (rows_of(tmp_path / name)["v1_2026-03-01"] for name in "ab")
-    assert memory["status"] == "memory_limit" and "GB of memory" in memory["reason"]
+    assert memory["status"] == "memory_limit" and "GB of memory, more than 0.04 GB" in memory["reason"]
     assert float(memory["peak_mb"]) > 40.0
     assert (wall["status"], wall["reason"]) == ("time_limit", "took more than 0.2 s")
     for name in "ab":
@@ -302,7 +302,8 @@ def test_on_dask(drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
         (["--name-parts", "0"], "--name-parts 0"),
         (["--drift", "1,2"], "--drift 1,2"),
         (["--drift", "1,2,x"], "--drift 1,2,x"),
-        (["--false-alarm-rate", "2"], "false_alarm_rate"),
+        (["--drift", "0,1,1"], "--drift 0,1,1: rotation_deg: found 0.0, expected at least 0.0001"),
+        (["--false-alarm-rate", "2"], "--false-alarm-rate 2: false_alarm_rate: found 2.0"),
         (["--vehicle-from", "("], "no regular expression"),
         (["--set", "nothing=1"], "nothing"),
         (["--init", "nowhere.json"], "nowhere.json"),
@@ -364,6 +365,25 @@ def test_drives_of_no_known_vehicle_are_named(
 
 
 @pytest.mark.slow
+def test_vehicles_of_which_some_drives_have_no_date_are_named(
+    drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Then none of their dates counts."""
+    for scan in drives.glob("v1_2026-03-08/*/*/velodyne/*.bin"):  # no copy of the other drive
+        scan.write_bytes(scan.read_bytes()[16:] + scan.read_bytes()[:16])
+    listed = tmp_path / "list.csv"
+    rows = [
+        f"{drives}/v1_2026-03-01,a,2026-03-01",
+        f"{drives}/v1_2026-03-08,a,",
+        f"{drives}/v2_2026-03-01,b,",
+    ]
+    listed.write_text("\n".join(["drive,vehicle,date", *rows]))
+    assert main(["batch", str(listed), "--out", str(tmp_path / "out"), *FAST]) == 3
+    said = capfd.readouterr().err
+    assert "note: some drives have no date, so their order counts, of the vehicles a\n" in said
+
+
+@pytest.mark.slow
 def test_a_file_of_the_options_is_the_same_to_the_end(
     drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -382,6 +402,7 @@ def test_a_file_of_the_options_is_the_same_to_the_end(
 @pytest.mark.parametrize(
     ("option", "named", "changed"),
     [
+        ("--camera-file", "camera.yaml", "camera.yaml"),
         ("--image-model", "net.yaml", "net.onnx"),
         ("--image-model", "net.onnx", "net.onnx.data"),
         ("--lidar-model", ".", "data_cfg.yaml"),
@@ -391,9 +412,11 @@ def test_a_file_of_the_options_is_the_same_to_the_end(
 def test_a_network_of_the_options_is_the_same_to_the_end(
     drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], option: str, named: str, changed: str
 ) -> None:
-    """Its weights, beside what describes it, or a file of its folder: labels would be of two networks."""
+    """Its weights, beside what describes it, or a file of its folder: labels would be of two networks. A
+    camera's file, too."""
     nets = tmp_path / "nets"
     nets.mkdir()
+    (nets / "camera.yaml").write_text("1")
     (nets / "net.yaml").write_text("network: net.onnx\nclasses: coco\n")
     for name in ("net.onnx", "net.onnx.data", "data_cfg.yaml"):
         (nets / name).write_text("1")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from pathlib import Path
 
 import gtsam
@@ -116,6 +117,12 @@ def test_what_is_done_is_kept_beside_the_table(tmp_path: Path, capsys: pytest.Ca
     assert (tmp_path / "basin.md").read_text() == table and records.read_bytes() == written
     assert main([*command[:-1], str(records)]) == 2
     assert "found the same file" in capsys.readouterr().err and records.read_bytes() == written
+
+
+def test_a_drive_without_labels_is_no_failure(kitti_drive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.rmtree(kitti_drive / "labels")
+    assert main(["experiment", "basin", "--data", str(kitti_drive.parents[1])]) == 2
+    assert "found no labels of points, expected both for method joint" in capsys.readouterr().err
 
 
 def test_records_of_another_kind_are_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,7 +11,6 @@ import pytest
 import sst_graph
 from sst_graph.cli import main
 from sst_graph.config import read_config
-from sst_graph.errors import ConfigError
 from sst_graph.experiments.registry import EXPERIMENTS, experiment
 from sst_graph.experiments.tasks.code_version import code_version, recorded_version
 
@@ -58,8 +57,14 @@ def test_the_version_is_the_commit_in_a_checkout_and_the_package_elsewhere(
 def test_registry() -> None:
     for name, entry in EXPERIMENTS.items():
         assert experiment(name) is entry and dataclasses.is_dataclass(entry.config) and entry.summary
-    with pytest.raises(ConfigError, match="table4"):
-        experiment("nothing")
+
+
+def test_another_name_tells_all_experiments_and_what_they_show(capsys: pytest.CaptureFixture[str]) -> None:
+    """An error message has a longest length: what does not fit is cut out of its middle."""
+    assert main(["experiment", "nothing"]) == 2
+    told = capsys.readouterr().err
+    for name, entry in EXPERIMENTS.items():
+        assert f"{name} ({entry.summary})" in told
 
 
 def test_a_file_of_settings_changes_what_it_names_alone(tmp_path: Path) -> None:

@@ -54,6 +54,14 @@ def test_drives_of_one_name_are_refused_and_told_apart_by_the_folder_above(tree:
     assert names == ["v1_20260301", "v1_20260308", "v2_20260301", "v2_20260308"]
 
 
+def test_a_drive_that_is_listed_twice_is_told(tree: Path, tmp_path: Path) -> None:
+    """No number of parts would make two names of one place."""
+    listed = tmp_path / "list.txt"
+    listed.write_text(f"{tree}/v1/20260301\n{tree}/v2/../v1/20260301/\n")
+    with pytest.raises(ConfigError, match=r"found the drive 20260301 twice, expected each drive once"):
+        find_drives(str(listed))
+
+
 def test_vehicle_and_date_by_an_expression(tree: Path) -> None:
     drives = find_drives(f"{tree}/*/*", name_parts=2)
     found = with_vehicles(drives, r"(?P<vehicle>v\d)/(?P<date>\d{8})$")

@@ -22,6 +22,7 @@ from sst_graph.factors import FactorError, PinholeCamera
 from sst_graph.fleet import BatchConfig, ListedDrive, Place, Record, write_summary
 from sst_graph.fleet.record import Cost, Numbers, Status
 from sst_graph.fleet.summary import page as summary_page
+from sst_graph.fleet.summary.tables import own_reason
 from sst_graph.fleet.vehicles.fused import vehicle_of
 from sst_graph.fleet.vehicles.walk import WalkConfig
 from sst_graph.reference import read_reference
@@ -310,6 +311,29 @@ def test_a_drive_that_is_there_twice_counts_once() -> None:
     alone = vehicle_of("v", [drives[0], drives[2]], records, WalkConfig()).calibration
     assert found.calibration is not None and alone is not None
     np.testing.assert_array_equal(found.calibration.covariance, alone.covariance)
+
+
+def test_a_drive_that_is_left_out_of_its_vehicle_says_why(tmp_path: Path) -> None:
+    """Its own result is right, so the status does not tell."""
+    drives = [drive("a", "v"), drive("copy", "v")]
+    twice = replace(result(1), diagnostics={**result(1).diagnostics, "scan_hashes": ("0" * 16,)})
+    records = {one.name: done(one.name, twice) for one in drives}
+    rows = write_summary(drives, records, Place(str(tmp_path)), BatchConfig()).rows
+    assert [(row["drive"], row["status"], row["reason"]) for row in rows] == [
+        ("copy", "ok", "not counted for v: it holds scans of a, which count once"),
+        ("a", "ok", ""),
+    ]
+    assert own_reason(rows[0]) == ""
+
+
+def test_drives_of_two_cameras_are_told() -> None:
+    drives = [drive("a", "v"), drive("b", "v")]
+    results = [replace(result(k), camera_name=name) for k, name in enumerate(("front", "left"))]
+    records = {one.name: done(one.name, found) for one, found in zip(drives, results, strict=True)}
+    found = vehicle_of("v", drives, records, WalkConfig())
+    assert found.reason.startswith("its drives name 2 cameras (front, left), which are fused as one")
+    records["b"] = done("b", replace(results[1], camera_name="front"))
+    assert vehicle_of("v", drives, records, WalkConfig()).reason == ""
 
 
 def test_drives_without_dates_count_in_their_order() -> None:

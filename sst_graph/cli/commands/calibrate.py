@@ -12,7 +12,7 @@ import gtsam
 from sst_graph.batch import CalibrationConfig, calibrate
 from sst_graph.batch.by_edges.choice import with_method_for
 from sst_graph.cli.inputs import calibration_settings, open_drives, starting_point
-from sst_graph.cli.labels import check_classes, require_labels
+from sst_graph.cli.labels import check_classes
 from sst_graph.cli.messages import complain, mention, say
 from sst_graph.cli.output_places import check_apart
 from sst_graph.cli.outputs import CALIBRATION, comparison, exit_code, result_numbers, write_calibration
@@ -20,6 +20,7 @@ from sst_graph.cli.progress import ProgressBar
 from sst_graph.cli.reading import given_cameras, options_of, warn_of_other_pairs, with_image_topic
 from sst_graph.cli.rig import refuse_rig_options, run_rig
 from sst_graph.cli.video import videos_beside
+from sst_graph.data.info.needed_labels import require_labels
 from sst_graph.files import atomic_directory
 from sst_graph.files.strict_json import strict_json
 from sst_graph.inspect.report import ReferenceErrors, verdict_and_summary

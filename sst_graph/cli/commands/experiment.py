@@ -41,6 +41,8 @@ def run(args: argparse.Namespace) -> int:
     if chosen.table is not None and args.out is not None:
         return _write_table(chosen.table, config, args)
     outputs_by_name = {"--out": args.out}
+    if figure := getattr(config, "figure", ""):
+        outputs_by_name["the figure"] = Path(figure)
     if args.out is not None and getattr(config, "records", None) == "":
         records = args.out.parent / RECORDS_NAME.format(args.name)
         config = dataclasses.replace(config, records=str(records))

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from sst_graph.data import open_source
 from sst_graph.errors import ConfigError
-from sst_graph.experiments.paper.config import PaperTableConfig
+from sst_graph.experiments.paper.config import VARIANTS, PaperTableConfig
+from sst_graph.experiments.starts import expect_labels
 from sst_graph.simulator import simulate
 from sst_graph.types import Source
 
@@ -49,7 +50,7 @@ def table_drives(config: PaperTableConfig) -> Sequence[TableDrive]:
 
     Raises:
         ConfigError: two drives of one name, or one without a reference calibration.
-        DataError: a drive that cannot be opened.
+        DataError: a drive that cannot be opened, or without the labels that a method needs.
     """
     if not config.data:
         return [
@@ -72,7 +73,9 @@ def _on_disk(path: str, config: PaperTableConfig) -> TableDrive:
             f"{path}: found no reference calibration, expected one (calib.txt, groundtruth.json)"
         )
     first, end = config.kitti_frames
-    if not (source.name.endswith(f"/{_KITTI_00}") and len(source) >= end):
-        return TableDrive(source.name, None, path, sequence, seed=config.seed)
-    name = f"{source.name}, frames {first} to {end - 1}"
-    return TableDrive(name, None, path, sequence, f"{first}:{end}", config.seed)
+    frames, name = None, source.name
+    if name.endswith(f"/{_KITTI_00}") and len(source) >= end:
+        frames, name = f"{first}:{end}", f"{name}, frames {first} to {end - 1}"
+    drive = TableDrive(name, None, path, sequence, frames, config.seed)
+    expect_labels(drive.open(config, 0), (VARIANTS[method].method for method in config.methods))
+    return drive

@@ -72,7 +72,7 @@ class PaperTable:
 
 TABLES: Mapping[str, PaperTable] = {
     "table1": PaperTable(
-        "SST-Calib's static stage on standing frames: bi-directional against single-directional loss",
+        "SST-Calib's static stage: bi- against single-directional loss",
         Layout("Static stage: bi-directional against single-directional loss", (_STATIC,), False),
         PaperTableConfig(
             methods=("static", "static-single", "joint"),
@@ -83,17 +83,17 @@ TABLES: Mapping[str, PaperTable] = {
         ),
     ),
     "table2": PaperTable(
-        "SST-Calib's static stage beside SemAlign, motion alone and the joint method",
+        "its static stage beside SemAlign, motion and joint",
         Layout("Static stage beside other methods", (_STATIC, _SEMALIGN), False),
         PaperTableConfig(methods=("static", "semalign", "motion", "joint")),
     ),
     "table3": PaperTable(
-        "SST-Calib's joint stage beside the joint method: pose and time offset, images one frame late",
+        "its joint stage beside the joint method, images a frame late",
         Layout("Joint stage: pose and time offset", (_JOINT,), True),
         PaperTableConfig(methods=("paper", "joint")),
     ),
     "table4": PaperTable(
-        "time offsets of 0, 1 and 2 frames: estimated by SST-Calib and by the joint method",
+        "time offsets of 0, 1 and 2 frames by both",
         Layout("Time offset by the frames that the images are late", (_JOINT,), True),
         PaperTableConfig(methods=("paper", "joint"), images_late=(0, 1, 2)),
     ),

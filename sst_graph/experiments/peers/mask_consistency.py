@@ -23,6 +23,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from sst_graph.errors import EstimationError
 from sst_graph.experiments.peers.frames import PeerFrame, PeerProblem, moved_by
 from sst_graph.odometry.lidar import GROUND_CLASSES
 from sst_graph.sampling import step_for
@@ -121,8 +122,14 @@ _SIMILARITY = np.abs(_AXES @ _AXES.T)
 
 
 def solve_mask_consistency(problem: PeerProblem, start: gtsam.Pose3) -> gtsam.Pose3:
-    """The best pose of the random search."""
+    """The best pose of the random search.
+
+    Raises:
+        EstimationError: no frame has more than one mask.
+    """
     frames = [_mask_frame(frame, start) for frame in problem.frames]
+    if all(np.count_nonzero(frame.sizes) < 2 for frame in frames):
+        raise EstimationError("the data hold no masks of images")
     rng = np.random.default_rng(problem.seed)
     width_deg, width_m = problem.range_deg + 0.5, problem.range_m + 0.05
 

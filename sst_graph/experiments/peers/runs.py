@@ -15,6 +15,7 @@ import numpy as np
 from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drives
 from sst_graph.batch.config import Method
 from sst_graph.config import Settings, setting
+from sst_graph.data.info.needed_labels import missing_labels
 from sst_graph.drive.preparation import Drive, prepare_drive
 from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.experiments.peers.frames import PeerProblem, peer_frames
@@ -224,6 +225,8 @@ def _read(task: PeerTask) -> _ReadDrive:
 def _solver(read: _ReadDrive, method: str, config: PeersConfig) -> _Solver:
     if method in PEERS:
         return _by_peer(read.problem, method, config)
+    if missing := missing_labels([read.source], method):
+        return _without(f"the data hold no {' and no '.join(missing)}")
     own = dataclasses.replace(config.calibration, method=cast(Method, method))
     drive = prepare_drives([read.source], own)[0] if method == "edges" else read.drive
     return _by_package(drive, own, read.problem.time_offset_s)
@@ -241,6 +244,15 @@ def _by_package(drive: Drive, config: CalibrationConfig, offset_s: float) -> _So
     def solve(start: gtsam.Pose3, range_deg: float) -> _Answer:
         result = calibrate_prepared([drive], start, config, initial_time_offset_s=offset_s)
         return _Answer(result.T_camera_lidar, result.status, _rotation_sigma_deg(result))
+
+    return solve
+
+
+def _without(why: str) -> _Solver:
+    """What stands in the place of a method that lacks something, which is no failure of it."""
+
+    def solve(start: gtsam.Pose3, range_deg: float) -> _Answer:
+        raise EstimationError(why)
 
     return solve
 

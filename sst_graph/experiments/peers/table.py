@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from sst_graph.experiments.markdown import NONE, median, table
 from sst_graph.experiments.peers.methods import OWN, PEERS
 from sst_graph.experiments.peers.runs import START, PeerRun, PeersConfig, runs_of, tasks_of
 from sst_graph.experiments.tasks.resumable import Work, rows_of
-from sst_graph.files import atomic_write_bytes
+from sst_graph.files import output_file
 from sst_graph.viz.matplotlib_figure import figure_class
 
 _COLOURS = (
@@ -36,14 +37,17 @@ def run(config: PeersConfig, progress: Progress | None = None) -> str:
     """The tables as Markdown: simulated streets, then real drives; the figure where it is asked for.
 
     Raises:
-        ConfigError: the records are of another kind.
+        ConfigError: the records are of another kind, or the figure cannot be written.
         DataError: a drive cannot be used.
         MissingDependencyError: a figure is asked for, and matplotlib is not installed.
     """
     figure_of = figure_class() if config.figure else None
-    runs = rows_of(Work(runs_of, PeerRun, config.jobs, config.records), tasks_of(config), progress)
-    if figure_of is not None:
-        atomic_write_bytes(config.figure, figure(runs, config, figure_of))
+    with ExitStack() as outputs:
+        # Whether it can be written is known before the runs, which take hours.
+        drawn = outputs.enter_context(output_file(config.figure, overwrite=True)) if config.figure else None
+        runs = rows_of(Work(runs_of, PeerRun, config.jobs, config.records), tasks_of(config), progress)
+        if drawn is not None and figure_of is not None:
+            drawn.write_bytes(figure(runs, config, figure_of))
     return markdown(runs, config)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from sst_graph.fleet.drives import ListedDrive
 from sst_graph.fleet.record import Record
-from sst_graph.fleet.vehicles.fused import Vehicle
+from sst_graph.fleet.vehicles.fused import COUNTED, Vehicle
 from sst_graph.inspect.inspection import HUMAN
 
 Row = dict[str, str | int | float | None]
@@ -41,6 +41,7 @@ def drive_rows(
     contradicting = {
         name: (one.name, finding) for one in vehicles for name, finding in one.contradicting.items()
     }
+    left_out = {name: (one.name, why) for one in vehicles for name, why in one.without.items()}
     rows: list[tuple[tuple[int, float, str], Row]] = []
     for drive in drives:
         record = records.get(drive.name) or Record(drive.name, drive.place.url, "not_run", "not run")
@@ -48,6 +49,10 @@ def drive_rows(
         if drive.name in contradicting:
             vehicle, finding = contradicting[drive.name]
             against = f"contradicts the other drives of {vehicle}: {finding.words}"
+            reason, rank = f"{against}; {reason}" if reason else against, min(rank, 6.5)
+        elif drive.name in left_out and record.status in COUNTED:
+            vehicle, why = left_out[drive.name]
+            against = f"not counted for {vehicle}: {why}"
             reason, rank = f"{against}; {reason}" if reason else against, min(rank, 6.5)
         numbers = record.numbers
         sigmas = None if numbers is None else numbers.sigmas * HUMAN
@@ -76,9 +81,10 @@ def drive_rows(
 
 
 def own_reason(row: Row) -> str:
-    """The reason of a drive's own result, without that it contradicts others."""
+    """The reason of a drive's own result, without what it is beside others of its vehicle."""
     vehicle = re.escape(str(row["vehicle"]))
-    return re.sub(rf"^contradicts the other drives of {vehicle}: [^;]*(?:; |$)", "", str(row["reason"]))
+    beside = rf"^(?:contradicts the other drives of|not counted for) {vehicle}: [^;]*(?:; |$)"
+    return re.sub(beside, "", str(row["reason"]))
 
 
 def vehicle_rows(vehicles: Sequence[Vehicle]) -> list[Row]:

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from sst_graph.config import expect_settings
 from sst_graph.covariance.observability import ObservabilityConfig, weak_directions
-from sst_graph.errors import EstimationError
+from sst_graph.errors import EstimationError, count_of
 from sst_graph.factors.arguments import checked_type
 from sst_graph.factors.errors import FactorError
 from sst_graph.files.strict_json import strict_json
@@ -22,6 +22,8 @@ from sst_graph.result import WeakDirection
 
 VehicleStatus = Literal["ok", "unobservable", "changed", "contradicted", "no_result"]
 
+COUNTED = ("ok", "unobservable")
+"""Status of the drives that are fused: what a drive does not determine has a large sigma."""
 _LIMITS = ObservabilityConfig()
 VERSION = 1
 
@@ -71,6 +73,7 @@ class Vehicle:
         without: drives that do not count, and why.
         weak: what the calibration does not determine to within the limits, the weakest first.
         dated: whether all have a date; else their order counts, a day from each to the next.
+        cameras: names of the cameras of those that count.
     """
 
     name: str
@@ -84,6 +87,7 @@ class Vehicle:
     without: Mapping[str, str]
     dated: bool
     weak: tuple[WeakDirection, ...] = ()
+    cameras: tuple[str, ...] = ()
 
     @property
     def reason(self) -> str:
@@ -91,6 +95,11 @@ class Vehicle:
         parts = [f"changed {change.words}" for change in self.changes]
         parts += [f"{name} contradicts the others: {one.words}" for name, one in self.contradicting.items()]
         parts += [f"by all drives, {one.sentence}" for one in self.weak[:1]]
+        if len(self.cameras) > 1:
+            parts.append(
+                f"its drives name {count_of(len(self.cameras), 'camera')} ({', '.join(self.cameras)}), which "
+                "are fused as one: make a vehicle of each, unless all of them are names of one"
+            )
         if self.calibration is None:
             parts.append("no drive of it has a result that counts")
         return "; ".join(parts)
@@ -146,6 +155,7 @@ def vehicle_of(
         without,
         dated,
         weak,
+        tuple(sorted({_numbers(records, drive.name).camera for drive in counted})),
     )
 
 
@@ -245,7 +255,7 @@ def _counted(
         record = records.get(drive.name)
         if record is None:
             without[drive.name] = "not run"
-        elif record.status not in ("ok", "unobservable") or record.numbers is None:
+        elif record.status not in COUNTED or record.numbers is None:
             without[drive.name] = f"{record.status}: {record.reason}" if record.reason else record.status
         else:
             hashes = record.numbers.scan_hashes

@@ -124,6 +124,20 @@ def test_a_drive_without_a_reference_is_refused(kitti: Path, capsys: pytest.Capt
     assert "found no reference calibration" in capsys.readouterr().err
 
 
+def test_a_drive_without_labels_is_no_failure_of_the_methods(
+    kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Only the frames that are used count; a method that needs no labels is run."""
+    for k in (1, 2):
+        (kitti / f"sequences/00/semantic_2/{k:06d}.png").unlink()
+    command = ["experiment", "table1", "--data", str(kitti), "--set", "kitti_frames=[1,3]"]
+    out = tmp_path / "out"
+    assert main([*command, "--methods", "motion,static", "--out", str(out / "table1.md")]) == 2
+    told = "kitti/00: found no semantic masks of images, expected both for method static, beside the drive"
+    assert told in capsys.readouterr().err and not list(out.glob("table1*"))
+    assert main([*command, "--methods", "motion"]) == 0
+
+
 def wait_for(condition: Callable[[], object]) -> None:
     deadline = time.monotonic() + 60.0
     while not condition():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import shutil
 from pathlib import Path
 
 import gtsam
@@ -136,6 +137,23 @@ def test_without_intensities_they_refuse() -> None:
             PEERS[name].solve(dataclasses.replace(problem(1.0), frames=bare), off(1.0))
 
 
+def test_without_masks_their_consistency_refuses() -> None:
+    bare = [dataclasses.replace(f, mask=np.zeros_like(f.mask), instances=None) for f in street()[2]]
+    with pytest.raises(EstimationError, match="no masks"):
+        solve_mask_consistency(dataclasses.replace(problem(1.0), frames=bare), off(1.0))
+
+
+def test_what_needs_labels_is_not_run_on_a_drive_without(
+    kitti_drive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.rmtree(kitti_drive / "labels")
+    small = ["--streets", "0", "--methods", "joint,semalign", "--set", "ranges_deg=[1]"]
+    assert main(["experiment", "peers", "--data", str(kitti_drive.parents[1]), *small]) == 0
+    told = capsys.readouterr().out
+    assert "| joint | the data hold no labels of points |" in told
+    assert "| semalign | the data hold no labels of points |" in told
+
+
 def test_an_edge_decays_by_gamma_a_pixel() -> None:
     grey = np.zeros((21, 41), np.uint8)
     grey[:, 20:] = 248
@@ -194,6 +212,19 @@ def test_the_command_writes_table_and_figure(tmp_path: Path, capsys: pytest.Capt
     assert b"<svg" in drawn and str(tmp_path).encode() not in drawn
     assert main(["experiment", "peers", *small]) == 0
     assert capsys.readouterr().out == text and svg.read_bytes() == drawn
+
+
+def test_a_figure_that_cannot_be_written_costs_no_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, file = tmp_path / "out" / "peers.md", tmp_path / "file"
+    file.touch()
+    for figure, words in ((file / "peers.svg", "file"), (out, "--out and the figure: found the same file")):
+        command = ["experiment", "peers", "--set", f'figure="{figure}"', "--out", str(out)]
+        assert main(command) == 2
+        told = capsys.readouterr().err
+        assert words in told and "runs:" not in told
+    assert not list(tmp_path.glob("out/peers*"))
 
 
 def test_wrong_settings_are_a_line(capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import math
 import os
 from pathlib import Path
@@ -78,20 +79,30 @@ def _config(args: argparse.Namespace) -> BatchConfig:
 
 
 def _walk(args: argparse.Namespace) -> WalkConfig:
-    given: dict[str, float] = {}
+    walk = WalkConfig()
     if args.drift is not None:
         try:
             degrees, centimetres, milliseconds = map(float, args.drift.split(","))
         except ValueError:
             raise ConfigError(f"--drift {args.drift}: expected three numbers DEG,CM,MS") from None
-        given = {
+        rates = {
             "rotation_deg": degrees,
             "translation_m": 0.01 * centimetres,
             "time_offset_s": 1e-3 * milliseconds,
         }
+        walk = _changed(walk, f"--drift {args.drift}", rates)
     if args.false_alarm_rate is not None:
-        given["false_alarm_rate"] = args.false_alarm_rate
-    return WalkConfig(**given)
+        rate = {"false_alarm_rate": args.false_alarm_rate}
+        walk = _changed(walk, f"--false-alarm-rate {args.false_alarm_rate:g}", rate)
+    return walk
+
+
+def _changed(walk: WalkConfig, option: str, values: dict[str, float]) -> WalkConfig:
+    """The settings with the values of an option, which an error names."""
+    try:
+        return dataclasses.replace(walk, **values)
+    except ConfigError as error:
+        raise ConfigError(f"{option}: {str(error).removeprefix('WalkConfig.')}") from None
 
 
 def _passed_on(args: argparse.Namespace) -> tuple[str, ...]:
@@ -183,8 +194,14 @@ def _say(outcome: BatchOutcome, out: Place) -> None:
         mention(f"{row['status']!s:<15} {row['drive']}: {on_terminal(str(row['drive']), str(row['reason']))}")
     if len(wrong) > _MOST_SAID:
         mention(f"{'':<15} and {len(wrong) - _MOST_SAID} more without result")
-    for vehicle in [one for one in outcome.vehicles if one.status != "ok"][:_MOST_SAID]:
+    for vehicle in [one for one in outcome.vehicles if one.reason][:_MOST_SAID]:
         mention(f"{'vehicle':<15} {vehicle.name}: {vehicle.reason}")
+    dates = {str(row["drive"]): str(row["date"]) for row in outcome.rows}
+    mixed = [
+        one.name for one in outcome.vehicles if not one.dated and any(dates[name] for name in one.drives)
+    ]
+    if mixed:
+        complain(f"note: some drives have no date, so their order counts, of the vehicles {_some(mixed)}")
     if outcome.others:
         complain(f"note: {others_line(outcome.others)}")
     if "summary.parquet" not in outcome.names:
