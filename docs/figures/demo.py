@@ -12,13 +12,26 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import gtsam
 import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph import SemanticClass, open_source
+from sst_graph.odometry import lidar_odometry
+from sst_graph.result import read_result
+from sst_graph.viz import draw_overlay
 
 FRAME = 12
+WRONG: dict[str, tuple[float, float]] = {
+    "right": (0.0, 0.0),
+    "0.3 deg off in yaw": (0.3, 0.0),
+    "1 deg off in yaw": (1.0, 0.0),
+    "10 cm off to the right": (0.0, 0.1),
+}
+"""Errors of calibrations that a picture compares: about the camera's y axis [deg], along its x axis [m]."""
+CUT_PX, ENLARGED = (160, 96), 3
+"""Part of a picture around a vehicle that is shown of each, and how much larger it is shown."""
 WIDTH, QUALITY = 1000, 82
 VERDICT_PX = (860, 560)
 CLOSE_UPS_PX = (1400, 960)
@@ -28,8 +41,9 @@ Picture = NDArray[np.uint8]
 
 
 def take(folder: Path, into: Path) -> None:
-    """Write demo_inputs.jpg, demo_overlay.jpg, demo_report.png and demo_close_ups.jpg."""
+    """Write demo_inputs.jpg, demo_overlay.jpg, demo_wrong.jpg, demo_report.png and demo_close_ups.jpg."""
     _save(into / "demo_inputs.jpg", _inputs(folder / "drive"))
+    _save(into / "demo_wrong.jpg", _wrong(folder))
     overlay = folder / "calibration" / f"overlay_drive_00_{FRAME:06d}.png"
     picture = cv2.imread(str(overlay))
     if picture is None:
@@ -77,6 +91,37 @@ def _inputs(folder: Path) -> Picture:
     figure.canvas.draw()
     canvas: Any = figure.canvas
     return np.asarray(canvas.buffer_rgba())[..., 2::-1].copy()
+
+
+def _wrong(folder: Path) -> Picture:
+    """The same part of an overlay under the result and under three that are wrong."""
+    drive = open_source(folder / "drive", camera="image_2")
+    result = read_result(folder / "calibration")
+    frame = drive[FRAME]
+    scans = [drive[k].scan for k in (FRAME - 1, FRAME, FRAME + 1)]
+    if frame.image is None or any(scan is None for scan in scans):
+        raise SystemExit(f"{folder}: found no scans around frame {FRAME}, expected a demo's")
+    motions = lidar_odometry(scan for scan in scans if scan is not None)
+    l_twist = np.mean([motion.mean_twist for motion in motions], axis=0)
+    mask = (frame.image.mask == SemanticClass.VEHICLE).astype(np.uint8)
+    found = cv2.connectedComponentsWithStats(mask)[2][1:]
+    whole = (found[:, cv2.CC_STAT_WIDTH] < 0.8 * CUT_PX[0]) & (found[:, cv2.CC_STAT_HEIGHT] < 0.8 * CUT_PX[1])
+    left, top, wide, high = found[whole][np.argmax(found[whole, cv2.CC_STAT_AREA]), :4]
+    parts = []
+    for words, (yaw_deg, right_m) in WRONG.items():
+        error = gtsam.Pose3(gtsam.Rot3.Ry(np.radians(yaw_deg)), np.array([right_m, 0.0, 0.0]))
+        cTl = error * result.T_camera_lidar
+        c_twist = cTl.AdjointMap() @ l_twist
+        picture = draw_overlay(frame, drive.camera, cTl, result.time_offset_s, c_twist)
+        strip = picture.shape[0] - drive.camera.height
+        x = int(np.clip(left + wide // 2 - CUT_PX[0] // 2, 0, picture.shape[1] - CUT_PX[0]))
+        y = int(np.clip(top + high // 2 - CUT_PX[1] // 2, 0, drive.camera.height - CUT_PX[1])) + strip
+        part = picture[y : y + CUT_PX[1], x : x + CUT_PX[0]]
+        part = cv2.resize(part, None, fx=ENLARGED, fy=ENLARGED, interpolation=cv2.INTER_NEAREST)
+        part = cv2.copyMakeBorder(part, 26, 4, 3, 3, cv2.BORDER_CONSTANT, value=(255, 255, 255))
+        cv2.putText(part, words, (5, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (30, 30, 30), 1, cv2.LINE_AA)
+        parts.append(part)
+    return np.asarray(np.vstack([np.hstack(parts[:2]), np.hstack(parts[2:])]), np.uint8)
 
 
 def _save(path: Path, picture: Picture) -> None:

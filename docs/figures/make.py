@@ -1,7 +1,8 @@
 """Draws the figures of the documentation: ``python docs/figures/make.py [NAME ...]``.
 
-``--measure`` first calibrates the simulated drives that two of them show (drives.csv); ``--demo OUT/demo``
-takes the pictures of a demo that ``make demo`` has written. ``--into DIR`` writes elsewhere.
+``--measure`` first calibrates, and tracks, the simulated drives that three of them show (drives.csv,
+alarm.csv); ``--demo OUT/demo`` takes the pictures of a demo that ``make demo`` has written. ``--into DIR``
+writes elsewhere.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ def figures() -> dict[str, Callable[[], Figure]]:
         "matches": drawings.matches,
         "observability": plots.observability,
         "sigma": plots.sigma,
+        "knock": plots.knock,
     }
 
 
@@ -45,7 +47,9 @@ def main() -> None:
     known = figures()
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"{', '.join(known)} (default: all)")
-    parser.add_argument("--measure", action="store_true", help="calibrate the drives of drives.csv first")
+    parser.add_argument(
+        "--measure", action="store_true", help="measure the simulated drives first"
+    )
     parser.add_argument("--demo", type=Path, metavar="DIR", help="take the pictures of this demo")
     parser.add_argument("--into", type=Path, default=HERE, metavar="DIR", help="folder for the figures")
     args = parser.parse_args()
@@ -53,9 +57,11 @@ def main() -> None:
     if unknown:
         parser.error(f"found {', '.join(sorted(unknown))}, expected some of {', '.join(known)}")
     if args.measure:
+        import alarm
         import drives
 
         drives.measure(print)
+        alarm.measure(print)
     if args.demo:
         import demo
 

@@ -1,7 +1,8 @@
-"""Plots of the calibrations in drives.csv."""
+"""Plots of the calibrations in drives.csv, and of the frames in alarm.csv."""
 
 from __future__ import annotations
 
+import alarm
 import drives
 import matplotlib.pyplot as plt
 import numpy as np
@@ -81,5 +82,31 @@ def sigma() -> Figure:
     right.set(xlabel="NEES", ylabel="share of drives below", ylim=(0.0, 1.02), xlim=(0.0, grid[-1]))
     right.set_title(f"mean NEES {nees.mean():.1f} of 7, {len(nees)} drives", fontsize=9)
     right.legend(fontsize=8, frameon=False, loc="lower right")
+    figure.tight_layout()
+    return figure
+
+
+STATUS_COLOURS = {"ok": "#2b8a3e", "unconfirmed": "#c77700", "unobservable": "#8b949e"}
+
+
+def knock() -> Figure:
+    """What the tracker says of a camera that is knocked: the estimate, two sigma, the status, the alarm."""
+    frames = list(alarm.read())
+    figure, axes = plt.subplots(figsize=(9.0, 3.0))
+    numbers = np.array([one.frame for one in frames])
+    truth = np.where(numbers < alarm.KNOCK, 0.0, alarm.KNOCK_DEG)
+    axes.step(numbers, truth, where="post", color="#1f2328", lw=1, label="truth")
+    for status, colour in STATUS_COLOURS.items():
+        own = [one for one in frames if one.status == status and np.isfinite(one.turn_deg)]
+        axes.errorbar(
+            [one.frame for one in own], [one.turn_deg for one in own], [2.0 * one.sigma_deg for one in own],
+            fmt=".", color=colour, ms=5, elinewidth=1, label=f"estimate ± 2σ, {status}",
+        )  # fmt: skip
+    for one in frames:
+        if one.alarm:
+            axes.axvline(one.frame, color="#d1342f", lw=1.5, label=f"alarm, frame {one.frame}")
+    axes.set(xlabel="frame", ylabel="turn of the camera [deg]", xlim=(0, len(frames)), ylim=(-0.6, 2.6))
+    axes.legend(fontsize=8, frameon=False, loc="upper left")
+    axes.grid(axis="y", color="#e6e9ec", lw=0.7)
     figure.tight_layout()
     return figure
