@@ -19,6 +19,7 @@ from sst_graph.data import open_source
 from sst_graph.data.folder.camera_file import read_camera
 from sst_graph.data.folder.stamps import stamped_files
 from sst_graph.errors import ConfigError, DataError
+from sst_graph.factors.camera import PinholeCamera
 from sst_graph.sweep_timing import SweepTiming
 
 Change = Callable[[Path], None]
@@ -245,6 +246,46 @@ def test_cameras_of_other_tools(folder: Path, kind: str) -> None:
             open_source(folder)
 
 
+ORB_SLAM = "%YAML:1.0\nCamera{}.fx: 700\nCamera{}.fy: 701\nCamera{}.cx: 4\nCamera{}.cy: 3\n"
+ORB_SIZE = "Camera.width: 8\nCamera.height: 6\nORBextractor.nFeatures: 2000\nThDepth: 40\n"
+VINS = "projection_parameters: {fx: 700, fy: 701, cx: 4, cy: 3}\nimage_width: 8\nimage_height: 6\n"
+VINS_FISHEYE = "projection_parameters: {mu: 700, mv: 701, u0: 4, v0: 3, k2: 0.1, k3: 0.2, k4: 0.3, k5: 0.4}\n"
+LIVO = "cam_fx: 700\ncam_fy: 701\ncam_cx: 4\ncam_cy: 3\ncam_width: 8\ncam_height: 6\nscale: 0.5\n"
+LENS, FISHEYE = (-0.3, 0.1, 0.01, 0.02, 0.0), (0.1, 0.2, 0.3, 0.4)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (ORB_SLAM.format(*[""] * 4) + ORB_SIZE, None),
+        (
+            f"{ORB_SLAM.format(*[''] * 4)}{ORB_SIZE}Camera.k1: -0.3\nCamera.k2: 0.1\nCamera.p1: 0.01\n"
+            "Camera.p2: 0.02\nCamera.fps: 10\nCamera.bf: 40.0\n",
+            LENS,
+        ),
+        (
+            f"{ORB_SLAM.format(*'1111')}{ORB_SIZE}Camera.type: KannalaBrandt8\nCamera1.k1: 0.1\n"
+            "Camera1.k2: 0.2\nCamera1.k3: 0.3\nCamera1.k4: 0.4\nCamera2.fx: 1\n",
+            FISHEYE,
+        ),
+        (
+            f"{VINS}model_type: PINHOLE\ndistortion_parameters: {{k1: -0.3, k2: 0.1, p1: 0.01, p2: 0.02}}\n",
+            LENS,
+        ),
+        (f"{VINS_FISHEYE}model_type: KANNALA_BRANDT\nimage_width: 8\nimage_height: 6\n", FISHEYE),
+        (f"{LIVO}cam_model: Pinhole\ncam_d0: -0.3\ncam_d1: 0.1\ncam_d2: 0.01\ncam_d3: 0.02\n", LENS),
+        (f"{LIVO}cam_model: EquidistantCamera\nk1: 0.1\nk2: 0.2\nk3: 0.3\nk4: 0.4\n", FISHEYE),
+    ],
+)
+def test_cameras_of_slam_systems(tmp_path: Path, text: str, expected: tuple[float, ...] | None) -> None:
+    (tmp_path / "camera.yaml").write_text(text)
+    camera, intrinsics = read_camera(tmp_path / "camera.yaml"), PinholeCamera(700.0, 701.0, 4.0, 3.0, 8, 6)
+    if expected == FISHEYE:
+        assert camera == FisheyeCamera(intrinsics, FISHEYE)
+    else:
+        assert camera == BrownConradyCamera(intrinsics, expected or ())
+
+
 K = "K: [700, 0, 4, 0, 701, 3, 0, 0, 1]\nwidth: 8\nheight: 6\n"
 CHAIN = "intrinsics: [700, 701, 4, 3]\nresolution: [8, 6]\n"
 
@@ -265,6 +306,17 @@ CHAIN = "intrinsics: [700, 701, 4, 3]\nresolution: [8, 6]\n"
         (f"{K}binning_x: .nan\n", "binning_x: nan, expected a whole number"),
         (f"{K}roi: {{x_offset: null}}\n", "x_offset: None, expected a whole number"),
         (f"{K}fisheye_model: perhaps\n", "fisheye_model: 'perhaps', expected a whole number"),
+        (ORB_SLAM.format(*[""] * 4), "no width, expected fx, fy, cx, cy, width, height of the camera"),
+        (f"{ORB_SLAM.format(*[''] * 4)}{ORB_SIZE}Camera.k4: 0.1\n", "the key 'k4', expected of the lens k1"),
+        (
+            f"{ORB_SLAM.format(*[''] * 4)}{ORB_SIZE}Camera.type: Fancy\n",
+            "camera model 'Fancy', expected one of",
+        ),
+        (f"{ORB_SLAM.format(*[''] * 4)}{ORB_SIZE}Camera.k1: x\n", r"\(k1\): found 'x'"),
+        (f"{VINS}model_type: MEI\n", "camera model 'MEI', expected one of pinhole, kannalabrandt"),
+        (f"{VINS}model_type: PINHOLE\ndistortion_parameters: 3\n", "distortion_parameters 3"),
+        (f"{LIVO}cam_model: ATAN\ncam_d0: 0.9\n", "camera model 'ATAN'"),
+        (f"{LIVO}cam_model: Pinhole\nk1: 0.1\n", "the key 'k1', expected of the lens cam_d0"),
     ],
 )
 def test_a_lens_that_is_not_understood_does_not_pass_for_none(tmp_path: Path, text: str, found: str) -> None:

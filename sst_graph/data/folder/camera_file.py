@@ -1,13 +1,14 @@
 """``camera.yaml`` and ``extrinsic.yaml`` of a folder.
 
-A camera is written in one of three ways:
+A camera is written in one of four ways:
 
 - plainly: fx, fy, cx, cy [px], width, height, and where the pictures are not rectified distortion_model and
   distortion;
 - as Kalibr's camchain: cam0 with camera_model, intrinsics, distortion_model, distortion_coeffs, resolution;
   or one camera alone as EuRoC's sensor.yaml has it;
 - as OpenCV's or ROS's calibration: camera_matrix, image_width, image_height, distortion_coefficients; or
-  the names that scripts and CameraInfo have for these, such as K, D, dist_coeffs, width, height, image_size.
+  the names that scripts and CameraInfo have for these, such as K, D, dist_coeffs, width, height, image_size;
+- as the settings of ORB-SLAM, VINS or FAST-LIVO have it (:mod:`sst_graph.data.folder.slam_camera`).
 
 An extrinsic is ``T_camera_lidar`` (4x4), or ``translation`` [m] and ``quaternion`` in the order w x y z.
 """
@@ -29,11 +30,15 @@ from sst_graph.cameras.readers import (
     cameras_from_kalibr,
     check_full_sensor,
 )
+from sst_graph.data.folder.slam_camera import slam_camera
 from sst_graph.errors import DataError
 from sst_graph.files.checked_values import checked_pose, pinhole_camera
 from sst_graph.files.yaml_file import number, numbers, read_yaml
 
-_EXPECTED = "fx, fy, cx, cy, width, height; or Kalibr's cam0; or OpenCV's camera_matrix"
+_EXPECTED = (
+    "fx, fy, cx, cy, width, height; or Kalibr's cam0; or OpenCV's camera_matrix; or ORB-SLAM's Camera.fx, "
+    "camodocal's projection_parameters, vikit's cam_fx"
+)
 _IN_CHAIN = re.compile(r"cam\d+", re.ASCII)
 _PLAIN = ("fx", "fy", "cx", "cy", "width", "height", "distortion_model", "distortion")
 _OPENCV = {
@@ -88,6 +93,8 @@ def read_camera(path: Path, name: str = "") -> CameraModel:
         calibration = _by_opencv_names(table, path)
         check_full_sensor(calibration, path)
         return camera_from_opencv({"distortion_coefficients": [], **calibration}, path)
+    if (camera := slam_camera(table, path)) is not None:
+        return camera
     raise DataError(path, f"keys {', '.join(map(str, table))}"[:200], _EXPECTED)
 
 
