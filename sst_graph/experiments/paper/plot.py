@@ -10,12 +10,16 @@ import numpy as np
 
 from sst_graph.experiments.paper.config import START, PaperTableConfig
 from sst_graph.experiments.paper.runs import CaseRun
-from sst_graph.experiments.paper.summary import Layout
+from sst_graph.experiments.paper.summary import Layout, Printed
 from sst_graph.viz.matplotlib_figure import figure_class
 
 _LEAST = 1e-3
 """Smaller values are drawn here, for the axes are logarithmic."""
 _COLOURS = ("#9aa2ab", "#d1342f", "#c77700", "#7a4fb5", "#1c64c8", "#2b8a3e")
+
+
+_OfRun = Callable[[CaseRun], float | None]
+_OfPaper = Callable[[Printed], float | None]
 
 
 def check_plot() -> None:
@@ -28,7 +32,8 @@ def check_plot() -> None:
 
 
 def plot_svg(runs: Sequence[CaseRun], layout: Layout, config: PaperTableConfig) -> str:
-    """The plot as SVG: rotation, translation and, where the table has it, the time offset.
+    """The plot as SVG: rotation, translation and, where the table has it, the time offset; the paper's own
+    figures, medians where it has them, as lines.
 
     Raises:
         MissingDependencyError, ConfigError: as :func:`check_plot`.
@@ -36,17 +41,23 @@ def plot_svg(runs: Sequence[CaseRun], layout: Layout, config: PaperTableConfig) 
     Figure = figure_class()
     import matplotlib as mpl
 
-    panels: list[tuple[str, Callable[[CaseRun], float | None]]] = [
-        ("QAD [deg]", lambda run: run.qad_deg),
-        ("ATD [cm]", lambda run: 100.0 * run.atd_m),
+    panels: list[tuple[str, _OfRun, _OfPaper]] = [
+        ("QAD [deg]", lambda run: run.qad_deg, lambda row: row.qad_deg and row.qad_deg[1]),
+        ("ATD [cm]", lambda run: 100.0 * run.atd_m, lambda row: row.atd_cm and row.atd_cm[1]),
     ]
     if layout.with_time:
-        panels.append(("absolute error of the time offset, by the stamps [ms]", _absolute_true_error_ms))
+        title = "absolute error of the time offset, by the stamps [ms]"
+        panels.append((title, _absolute_true_error_ms, lambda row: row.time_error_ms))
     text = io.StringIO()
     with mpl.rc_context({"svg.hashsalt": "sst-graph", "font.size": 9.0}):
         figure = Figure(figsize=(4.0 * len(panels), 3.6), layout="constrained")
-        for axes, (title, value) in zip(figure.subplots(1, len(panels)), panels, strict=True):
+        for axes, (title, value, printed) in zip(figure.subplots(1, len(panels)), panels, strict=True):
             _panel(axes, runs, config, value)
+            for row, dashes in zip(layout.printed, ("--", ":"), strict=False):
+                if (height := printed(row)) is not None:
+                    axes.axhline(height, color="#1f2328", ls=dashes, lw=1, label=f"{row.name}, as printed")
+            if axes.get_legend_handles_labels()[0]:
+                axes.legend(fontsize=7, frameon=False)
             axes.set_title(title, fontsize=9)
         figure.suptitle(f"{layout.heading} (crosses: failed runs; bars: medians of all)", fontsize=9)
         figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})

@@ -108,6 +108,7 @@ def test_a_plot_has_the_methods_below_its_dots(name: str) -> None:
     assert ElementTree.fromstring(svg).tag.endswith("svg")
     assert "<!-- joint -->" in svg and "<!-- paper -->" in svg and "<!-- ATD [cm] -->" in svg
     assert ("time offset" in svg) == TABLES[name].layout.with_time
+    assert all(f"<!-- {row.name}, as printed -->" in svg for row in TABLES[name].layout.printed)
     assert svg == plot_svg(RUNS, TABLES[name].layout, CONFIG)
 
 
