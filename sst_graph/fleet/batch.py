@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
 
+import sst_graph
 from sst_graph.config import Settings, expect_settings, setting
 from sst_graph.covariance.observability import ObservabilityConfig
 from sst_graph.errors import ConfigError, DataError
@@ -126,10 +127,11 @@ class BatchOutcome:
 
 
 @contextmanager
-def open_batch(out: Place, options: Sequence[str]) -> Iterator[None]:
+def open_batch(out: Place, options: Sequence[str]) -> Iterator[str]:
     """Take the folder of a batch, new or begun before with the same options.
 
-    What a killed run left unfinished there is removed.
+    What a killed run left unfinished there is removed. The context is a sentence where another version of
+    sst-graph began it, else empty.
 
     Raises:
         ConfigError: it holds something else, or a batch with other options, or another run is at it.
@@ -137,10 +139,12 @@ def open_batch(out: Place, options: Sequence[str]) -> Iterator[None]:
     """
     if out.is_local and out.exists() and not out.is_folder():
         raise ConfigError(f"{out}: found a file, expected a folder or nothing")
+    begun_with = sst_graph.__version__
     if (out / BATCH).exists():
         place = (out / BATCH).url
         table = json_table(json_of((out / BATCH).read(), place, BATCH), place, FORMAT, VERSION)
         before = [str(one) for one in table.sequence("options")]
+        begun_with = table.text("sst_graph", begun_with)
         _check_files(out, table.mapping("files"), options)
         if before != list(options):
             raise ConfigError(
@@ -157,6 +161,7 @@ def open_batch(out: Place, options: Sequence[str]) -> Iterator[None]:
             document = {
                 "format": FORMAT,
                 "version": VERSION,
+                "sst_graph": begun_with,
                 "options": list(options),
                 "files": _digests(options),
             }
@@ -166,7 +171,14 @@ def open_batch(out: Place, options: Sequence[str]) -> Iterator[None]:
             if folder.is_local and folder.is_folder():
                 sweep_folder(folder.path)
         remove_unfinished(out)
-        yield
+        yield _of_versions(out, begun_with)
+
+
+def _of_versions(out: Place, begun_with: str) -> str:
+    now = sst_graph.__version__
+    if begun_with == now:
+        return ""
+    return f"{out}: was begun by sst-graph {begun_with}, is gone on with by {now}: earlier results stay"
 
 
 def _digests(options: Sequence[str]) -> dict[str, str]:

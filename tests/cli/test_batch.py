@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+import sst_graph
 from sst_graph.cli import main
 from sst_graph.fleet import Place, Record
 
@@ -235,6 +236,18 @@ def test_what_a_killed_batch_left_is_removed_when_the_next_one_begins(tmp_path: 
         assert not any(one.exists() for one in left)
         assert stage.path.exists() and (out / "drives" / "v1_2026-03-01").exists()
     stage.release()
+
+
+def test_another_version_that_goes_on_with_a_batch_is_told(tmp_path: Path) -> None:
+    from sst_graph.fleet import open_batch
+
+    out = tmp_path / "out"
+    with open_batch(Place(str(out)), ()) as note:
+        assert note == ""
+    begun = out / "batch.json"
+    begun.write_text(begun.read_text().replace(f'"{sst_graph.__version__}"', '"0.0.7"'))
+    with open_batch(Place(str(out)), ()) as note:
+        assert "begun by sst-graph 0.0.7" in note and sst_graph.__version__ in note
 
 
 def test_what_ends_a_batch_leaves_nothing_unfinished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

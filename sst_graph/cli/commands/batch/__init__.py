@@ -52,7 +52,9 @@ def run(args: argparse.Namespace) -> int:
         drives = with_vehicles(drives, args.vehicle_from)
         _say_without_vehicle(drives)
     _check_apart(drives, out)
-    with open_batch(out, config.options), children_ended(out), ProgressOnStderr() as told:
+    with open_batch(out, config.options) as note, children_ended(out), ProgressOnStderr() as told:
+        if note:
+            complain(f"note: {note}")
         records = run_batch(drives, out, config, told)
         told.close()
         outcome = write_summary(drives, records, out, config)
