@@ -13,6 +13,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from sst_graph.drive.preparation import Progress
@@ -96,6 +97,7 @@ def _records(work: Work[T, R]) -> Iterator[tuple[_Rows[R], set[str], Callable[[s
         return
     version = recorded_version()
     try:
+        Path(work.records).parent.mkdir(parents=True, exist_ok=True)
         file = open(work.records, "ab", buffering=0)  # noqa: SIM115 (closed below)
     except OSError as error:
         raise ConfigError(f"{work.records}: records cannot be written ({error.strerror})") from error

@@ -180,8 +180,10 @@ def test_other_files_are_refused_in_a_line(tmp_path: Path, content: str) -> None
     assert path.read_bytes() == before
 
 
-def test_a_folder_is_refused(tmp_path: Path) -> None:
+def test_a_folder_is_refused_and_one_that_is_missing_made(tmp_path: Path) -> None:
     with pytest.raises(SstGraphError):
         run(tmp_path, 2)
+    assert not (tmp_path / "none").exists()
+    run(tmp_path / "none" / "records", 2)
     with pytest.raises(ConfigError, match="cannot be written"):
-        run(tmp_path / "none" / "records", 2)
+        run(tmp_path / "none" / "records" / "records", 2)
