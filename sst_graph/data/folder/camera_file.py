@@ -16,7 +16,7 @@ An extrinsic is ``T_camera_lidar`` (4x4), or ``translation`` [m] and ``quaternio
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +30,11 @@ from sst_graph.cameras.readers import (
     cameras_from_kalibr,
     check_full_sensor,
 )
+from sst_graph.data.folder.camera_entries import pinhole_by_names, plain_key, refuse_of_lens
 from sst_graph.data.folder.slam_camera import slam_camera
 from sst_graph.errors import DataError
-from sst_graph.files.checked_values import checked_pose, pinhole_camera
-from sst_graph.files.yaml_file import number, numbers, read_yaml
+from sst_graph.files.checked_values import checked_pose
+from sst_graph.files.yaml_file import numbers, read_yaml
 
 _EXPECTED = (
     "fx, fy, cx, cy, width, height; or Kalibr's cam0; or OpenCV's camera_matrix; or ORB-SLAM's Camera.fx, "
@@ -55,8 +56,6 @@ _OPENCV = {
 """OpenCV's names, and others for the same in small letters without underscores."""
 _EUROC = {"distortion_coefficients": "distortion_coeffs", "radial-tangential": "radtan"}
 """EuRoC's names, and Kalibr's for the same."""
-_OF_LENS, _COEFFICIENT = re.compile(r".*(dist|coef).*", re.ASCII), re.compile(r"[kp]\d", re.ASCII)
-"""Names of what a lens does, in small letters without underscores; of numbers alone (P1 is a matrix, too)."""
 _ROUNDED = 1e-3
 """A quaternion's length differs from 1 by no more than its digits were rounded."""
 
@@ -76,9 +75,7 @@ def read_camera(path: Path, name: str = "") -> CameraModel:
     if "fx" in table:
         if unknown := [key for key in table if key not in _PLAIN]:
             raise DataError(path, f"the key {unknown[0]!r:.60}", f"none but {', '.join(_PLAIN)}")
-        fx, fy, cx, cy, *size = (number(_entry(table, key, path), f"{path} ({key})") for key in _PLAIN[:6])
-        width, height = (_whole(side, path) for side in size)
-        intrinsics = pinhole_camera((fx, fy, cx, cy), (width, height), path)
+        intrinsics = pinhole_by_names(table, _PLAIN[:6], path, _EXPECTED)
         coefficients = numbers(table.get("distortion") or [], f"{path} (distortion)")
         return camera_of(intrinsics, str(table.get("distortion_model", "none")), coefficients, path)
     if "intrinsics" in table and "resolution" in table:
@@ -87,9 +84,9 @@ def read_camera(path: Path, name: str = "") -> CameraModel:
     if any(isinstance(value, dict) for value in chain.values()):
         key = _of_chain(chain, name, path)
         own = _of_kalibr(chain[key])
-        _refuse_of_lens(own, ("distortion_coeffs", "distortion_model"), path)
+        refuse_of_lens(own, ("distortion_coeffs", "distortion_model"), path)
         return cameras_from_kalibr({key: {"camera_model": "pinhole", **own}}, path)[key].model
-    if any(_plain_key(key) in _OPENCV["camera_matrix"] for key in table):
+    if any(plain_key(key) in _OPENCV["camera_matrix"] for key in table):
         calibration = _by_opencv_names(table, path)
         check_full_sensor(calibration, path)
         return camera_from_opencv({"distortion_coefficients": [], **calibration}, path)
@@ -107,24 +104,6 @@ def _of_kalibr(table: Mapping[str, Any]) -> dict[str, Any]:
     return named
 
 
-def _refuse_of_lens(table: Mapping[str, Any], known: Collection[str], path: Path) -> None:
-    """Refuse entries of a lens that are not understood: without them the lens would pass for none.
-
-    Raises:
-        DataError: there is one.
-    """
-    for key, value in table.items():
-        plain, single = _plain_key(key), isinstance(value, int | float)
-        if str(key) not in known and (
-            _OF_LENS.fullmatch(plain) or (single and _COEFFICIENT.fullmatch(plain))
-        ):
-            raise DataError(path, f"the key {key!r:.60}", f"of the lens {', '.join(known)}")
-
-
-def _plain_key(key: object) -> str:
-    return str(key).lower().replace("_", "")
-
-
 def _by_opencv_names(table: Mapping[str, Any], path: Path) -> dict[str, Any]:
     """The table with OpenCV's names in the place of others for the same.
 
@@ -133,12 +112,12 @@ def _by_opencv_names(table: Mapping[str, Any], path: Path) -> dict[str, Any]:
     """
     named: dict[str, Any] = {}
     for key, value in table.items():
-        plain = _plain_key(key)
+        plain = plain_key(key)
         name = next((name for name, others in _OPENCV.items() if plain in others), None)
         if name in named:
             raise DataError(path, f"{key!r:.60} beside another entry for {name}", "one of them")
         named[str(key) if name is None else name] = value
-    _refuse_of_lens(named, ("distortion_coefficients", "distortion_model"), path)
+    refuse_of_lens(named, ("distortion_coefficients", "distortion_model"), path)
     if "image_size" in named:
         width, height = numbers(named.pop("image_size"), f"{path} (image size)", 2)
         named = {"image_width": width, "image_height": height} | named
@@ -199,9 +178,3 @@ def _entry(table: Mapping[Any, Any], name: str, path: Path) -> Any:
         expected = _POSE if name in ("translation", "quaternion") else _EXPECTED
         raise DataError(path, f"no {name}", expected)
     return table[name]
-
-
-def _whole(side: float, path: Path) -> int:
-    if side != round(side):
-        raise DataError(path, f"an image side of {side} px", "a whole number")
-    return int(side)

@@ -18,16 +18,16 @@ from typing import Any
 
 from sst_graph.cameras.model import CameraModel
 from sst_graph.cameras.readers import camera_of
+from sst_graph.data.folder.camera_entries import pinhole_by_names, refuse_of_lens
 from sst_graph.errors import DataError
-from sst_graph.files.checked_values import pinhole_camera
 from sst_graph.files.yaml_file import number
 
 Table = Mapping[str, Any]
 
 _PLUMB_BOB, _FISHEYE = ("k1", "k2", "p1", "p2", "k3"), ("k1", "k2", "k3", "k4")
 _ORB = re.compile(r"Camera1?\.(\w+)", re.ASCII)
-_LENS = re.compile(r"(cam_)?[kpd]\d|xi|alpha|lambda", re.ASCII)
-"""Names of numbers that say what a lens does."""
+_COEFFICIENT = re.compile(r"(cam)?[kpd]\d|xi|alpha|lambda", re.ASCII)
+"""Plain names of numbers that say what a lens does."""
 
 
 @dataclass(frozen=True)
@@ -50,15 +50,9 @@ class _Camera:
         """Raises:
         DataError: an entry is missing, no number, or of another lens.
         """
-        unknown = [key for key in self.entries if _LENS.fullmatch(key) and key not in self.lens]
-        if unknown:
-            raise DataError(place, f"the key {unknown[0]!r:.60}", f"of the lens {', '.join(self.lens)}")
-        if missing := [name for name in self.intrinsics if name not in self.entries]:
-            raise DataError(place, f"no {missing[0]}", f"{', '.join(self.intrinsics)} of the camera")
-        fx, fy, cx, cy, *size = (number(self.entries[name], f"{place} ({name})") for name in self.intrinsics)
-        if any(side != round(side) for side in size):
-            raise DataError(place, f"an image of {size[0]:g} x {size[1]:g} px", "whole numbers")
-        intrinsics = pinhole_camera((fx, fy, cx, cy), (int(size[0]), int(size[1])), place)
+        refuse_of_lens(self.entries, self.lens, place, _COEFFICIENT)
+        expected = f"{', '.join(self.intrinsics)} of the camera"
+        intrinsics = pinhole_by_names(self.entries, self.intrinsics, place, expected)
         values = [number(self.entries.get(name, 0.0), f"{place} ({name})") for name in self.lens]
         return camera_of(intrinsics, self.distortion, values, place)
 
