@@ -69,12 +69,14 @@ class RunningSums:
             by_object: keep its matches object by object, too.
         """
         own = replace(pair, scores=pair.scores.columns(slice(len(columns))))
-        vars(self).update(vars(self.with_pairs([own], [columns])))
+        more = self.with_pairs([own], [columns])
+        self.weight, self.curvature = more.weight, more.curvature
+        self.shifts, self.by_shifts = more.shifts, more.by_shifts
         self.last_seen.update(dict.fromkeys(pair.scores.sides.tolist(), scan))
         closed = [side for side, last in self.last_seen.items() if last < scan - OBJECT_MEMORY]
         for side in closed:
             del self.last_seen[side]
-        self.scores = self.scores.without_sides(closed)
+        self.scores = more.scores.without_sides(closed)
         self.recent.append(pair.residuals)
         if by_object and pair.objects is not None:
             self.objects.add(pair.objects)
