@@ -16,6 +16,7 @@ from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.factors.motion import CameraTwist, moved_points
 from sst_graph.features.mask_contour import ContourMap
+from sst_graph.points import transformed_points
 from sst_graph.types import Calibration, CameraImage, FloatArray, Frame, Scan, SemanticClass
 
 Picture = NDArray[np.uint8]
@@ -160,11 +161,13 @@ def _projected(
 ) -> tuple[FloatArray, NDArray[np.uint8], FloatArray]:
     """Pixels (m, 2), classes (m,) and depths (m,) [m] of the points on the image, far ones first."""
     lPs = scan.points.astype(np.float64)
-    taus_s = np.full(len(lPs), (image.stamp_ns - scan.stamp_ns) * 1e-9 + time_offset_s)
-    if scan.offsets_s is not None:
-        taus_s -= scan.offsets_s
-    motion = CameraTwist(np.zeros(6) if c_twist is None else c_twist, np.zeros(6))
-    cPs = moved_points(cTl, lPs.T, taus_s, motion, "se3", None).cPs.T
+    if c_twist is None:
+        cPs = transformed_points(cTl, lPs)
+    else:
+        taus_s = np.full(len(lPs), (image.stamp_ns - scan.stamp_ns) * 1e-9 + time_offset_s)
+        if scan.offsets_s is not None:
+            taus_s -= scan.offsets_s
+        cPs = moved_points(cTl, lPs.T, taus_s, CameraTwist(c_twist, np.zeros(6)), "se3", None).cPs.T
     uvs = camera.project(cPs)
     seen = np.flatnonzero(camera.in_front(cPs))
     seen = seen[camera.in_image(uvs[seen])]
