@@ -22,6 +22,7 @@ import gtsam
 import numpy as np
 
 from sst_graph import Tracker
+from sst_graph.experiments.wrong_drives import turned_picture
 from sst_graph.metrics import nees
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
 from sst_graph.simulator.config import Motion
@@ -52,12 +53,7 @@ class Step:
         """The image as the camera has it after the step; what it did not see before is unknown."""
         mask = image.mask
         if any(self.turn_deg):
-            K = drive.camera.matrix
-            H = K @ self.rotation.matrix() @ np.linalg.inv(K)
-            size = (drive.camera.width, drive.camera.height)
-            mask = cv2.warpPerspective(mask, H, size, flags=cv2.INTER_NEAREST, borderValue=255).astype(
-                np.uint8
-            )
+            mask = turned_picture(mask, drive.camera, self.rotation, cv2.INTER_NEAREST, borderValue=255)
         return dataclasses.replace(image, mask=mask, stamp_ns=image.stamp_ns + round(1e6 * self.late_ms))
 
 

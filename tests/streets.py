@@ -15,7 +15,7 @@ from stored import simulated, stored
 from sst_graph import Tracker, TrackerConfig
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import Drive, PrepareConfig, prepare_drive
-from sst_graph.experiments.wrong_drives import with_distortion
+from sst_graph.experiments.wrong_drives import turned_picture, with_distortion
 from sst_graph.simulator import SimulatedDrive, SimulationConfig
 from sst_graph.types import CameraImage, Frame, SemanticClass
 
@@ -148,10 +148,7 @@ def sigmas_apart(tracker: Tracker, cTl: gtsam.Pose3, time_offset_s: float) -> fl
 
 def turned(image: CameraImage, street: SimulatedDrive, R: gtsam.Rot3, **border: int) -> CameraImage:
     """The image of a turned camera; ``border`` says what it shows where it did not look before."""
-    K = street.camera.matrix
-    H = K @ R.matrix() @ np.linalg.inv(K)
-    size = (street.camera.width, street.camera.height)
-    mask = np.asarray(cv2.warpPerspective(image.mask, H, size, flags=cv2.INTER_NEAREST, **border), np.uint8)
+    mask = turned_picture(image.mask, street.camera, R, cv2.INTER_NEAREST, **border)
     return dataclasses.replace(image, mask=mask)
 
 

@@ -15,10 +15,11 @@ import gtsam
 import numpy as np
 
 from sst_graph import CameraImage, PinholeCamera, Tracker
+from sst_graph.experiments.wrong_drives import turned_picture
 from sst_graph.simulator import SimulationConfig, simulate
 
 FILE = Path(__file__).with_name("alarm.csv")
-FRAMES, KNOCK, KNOCK_DEG = 120, 80, 1.0
+FRAMES, KNOCK, KNOCK_DEG = 130, 80, 1.0
 
 
 @dataclass(frozen=True)
@@ -41,14 +42,12 @@ class Tracked:
 
 
 def turned(image: CameraImage, camera: PinholeCamera) -> CameraImage:
-    """The image of a camera that looks further to the side: a warp by K R inv(K)."""
-    warp = camera.matrix @ gtsam.Rot3.Ry(np.radians(KNOCK_DEG)).matrix() @ np.linalg.inv(camera.matrix)
-    size = (camera.width, camera.height)
-    mask = cv2.warpPerspective(
-        image.mask, warp, size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
+    """The image of a camera that looks further to the side."""
+    R, border = gtsam.Rot3.Ry(np.radians(KNOCK_DEG)), {"borderMode": cv2.BORDER_REPLICATE}
+    mask = turned_picture(image.mask, camera, R, cv2.INTER_NEAREST, **border)
+    return replace(
+        image, mask=mask, pixels=turned_picture(image.pixels, camera, R, cv2.INTER_LINEAR, **border)
     )
-    pixels = cv2.warpPerspective(image.pixels, warp, size, borderMode=cv2.BORDER_REPLICATE)
-    return replace(image, mask=np.asarray(mask, np.uint8), pixels=np.asarray(pixels, np.uint8))
 
 
 def measure(said: Callable[[str], None]) -> None:

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph import SemanticClass, open_source
-from sst_graph.odometry import lidar_odometry
+from sst_graph.cli.pictures import camera_twist
+from sst_graph.data.frame_parts import RecentReader
 from sst_graph.result import read_result
 from sst_graph.viz import draw_overlay
 
@@ -98,20 +99,17 @@ def _wrong(folder: Path) -> Picture:
     drive = open_source(folder / "drive", camera="image_2")
     result = read_result(folder / "calibration")
     frame = drive[FRAME]
-    scans = [drive[k].scan for k in (FRAME - 1, FRAME, FRAME + 1)]
-    if frame.image is None or any(scan is None for scan in scans):
-        raise SystemExit(f"{folder}: found no scans around frame {FRAME}, expected a demo's")
-    motions = lidar_odometry(scan for scan in scans if scan is not None)
-    l_twist = np.mean([motion.mean_twist for motion in motions], axis=0)
+    if frame.image is None:
+        raise SystemExit(f"{folder}: found no image of frame {FRAME}, expected a demo's")
     mask = (frame.image.mask == SemanticClass.VEHICLE).astype(np.uint8)
     found = cv2.connectedComponentsWithStats(mask)[2][1:]
     whole = (found[:, cv2.CC_STAT_WIDTH] < 0.8 * CUT_PX[0]) & (found[:, cv2.CC_STAT_HEIGHT] < 0.8 * CUT_PX[1])
     left, top, wide, high = found[whole][np.argmax(found[whole, cv2.CC_STAT_AREA]), :4]
-    parts = []
+    reader, parts = RecentReader(drive), []
     for words, (yaw_deg, right_m) in WRONG.items():
         error = gtsam.Pose3(gtsam.Rot3.Ry(np.radians(yaw_deg)), np.array([right_m, 0.0, 0.0]))
         cTl = error * result.T_camera_lidar
-        c_twist = cTl.AdjointMap() @ l_twist
+        c_twist = camera_twist(reader, FRAME, cTl)
         picture = draw_overlay(frame, drive.camera, cTl, result.time_offset_s, c_twist)
         strip = picture.shape[0] - drive.camera.height
         x = int(np.clip(left + wide // 2 - CUT_PX[0] // 2, 0, picture.shape[1] - CUT_PX[0]))

@@ -10,10 +10,12 @@ from dataclasses import replace
 from typing import Any
 
 import cv2
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.factors.camera import PinholeCamera
 from sst_graph.simulator import SimulatedDrive
 from sst_graph.types import CameraImage, Scan, SemanticClass
 
@@ -52,6 +54,19 @@ def with_distortion(drive: KeptDrive, k1: float, k2: float = 0.0) -> KeptDrive:
         return CameraImage(image.stamp_ns, mask.astype(np.uint8), pixels, numbers)
 
     return drive.with_images(change)
+
+
+def turned_picture(
+    picture: NDArray[np.uint8], camera: PinholeCamera, R: gtsam.Rot3, interpolation: int, **border: Any
+) -> NDArray[np.uint8]:
+    """A picture or a mask as the camera has it after a turn about its centre: a warp by K R inv(K).
+
+    Args:
+        interpolation, border: OpenCV's ``flags``, ``borderMode`` and ``borderValue``; of what it did not see.
+    """
+    H = camera.matrix @ R.matrix() @ np.linalg.inv(camera.matrix)
+    size = (camera.width, camera.height)
+    return np.asarray(cv2.warpPerspective(picture, H, size, flags=interpolation, **border), np.uint8)
 
 
 def with_ranges(drive: KeptDrive, bias_m: float, scale: float) -> KeptDrive:
