@@ -297,6 +297,7 @@ CHAIN = "intrinsics: [700, 701, 4, 3]\nresolution: [8, 6]\n"
         (f"{K}radial_distortion: [-0.3, 0.1]\n", "the key 'radial_distortion'"),
         (f"{K}coeffs: [-0.3, 0.1, 0, 0]\n", "the key 'coeffs'"),
         (f"{K}k1: -0.3\nk2: 0.1\n", "the key 'k1'"),
+        (f"{K}k1: -3e-1\n", "the key 'k1'"),  # text by YAML 1.1
         (f"{K}D: [-0.3, 0, 0, 0]\ndist_coeffs: [0, 0, 0, 0]\n", "'dist_coeffs' beside another entry"),
         (f"{CHAIN}distortion: [-0.3, 0.1, 0, 0]\n", "the key 'distortion', expected of the lens"),
         (f"{CHAIN}distortion_model: radtan\n", "the distortion 'radtan' without coefficients"),
