@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from sst_graph.cameras import Rectification
 from sst_graph.classes import MaskEncoding
 from sst_graph.data.lidar_pose import TimingFromCloud, in_lidar_axes, parse_lidar_pose
+from sst_graph.data.point_times import StreamClock
 from sst_graph.data.ros.bag import TF_MESSAGE
 from sst_graph.data.ros.camera_info import (
     ImageGeometry,
@@ -22,7 +23,7 @@ from sst_graph.data.ros.camera_info import (
     image_geometry,
     is_other_camera,
 )
-from sst_graph.data.ros.clouds import cloud_of
+from sst_graph.data.ros.clouds import cloud_of, times_of
 from sst_graph.data.ros.frames import CloudReading, check_size, mask_classes, scan_of
 from sst_graph.data.ros.images import picture_of
 from sst_graph.data.ros.link_frame import LEAST_SEEN, LINK_AXES, is_link
@@ -72,6 +73,7 @@ class CalibrationNode:
         self.settings, self._config = settings, config or TrackerConfig()
         self._encoding = MaskEncoding(settings.label_encoding)
         self._reading = _reading(settings)
+        self._point_clock = StreamClock(settings.sweep_stamp)
         # None where the clouds are in the LiDAR's axes.
         self._T_cloud_lidar = parse_lidar_pose(settings.lidar_pose) if settings.lidar_pose else None
         given = settings.init not in (INIT_TF, INIT_NONE)
@@ -168,7 +170,12 @@ class CalibrationNode:
         """A PointCloud2."""
 
         def take() -> None:
-            self._queue.add(self._stamp_ns(message, self.lidar), True, message)
+            stamp_ns = self._stamp_ns(message, self.lidar)
+            self._queue.add(stamp_ns, True, message)
+            # Where the first clouds are of the stamps' clock, the later ones are.
+            if self._reading.stored_times and (self.tracker is None or self._point_clock.words):
+                with suppress(DataError):  # What is wrong with a cloud is said when it is used.
+                    self._point_clock.add(stamp_ns, times_of(message, self.lidar.topic), now_ns)
 
         return self._received(self.lidar, now_ns, take)
 
@@ -200,6 +207,9 @@ class CalibrationNode:
         behind_s = max(one.waited_s for one in sensors)
         found = [one.diagnosis(now_ns, self.settings.silent_s) for one in sensors]
         found[0] = self._with_camera_infos(found[0], now_ns)
+        if self._point_clock.words:
+            values = {**found[1].values, "times_of_points": self._point_clock.words}
+            found[1] = dataclasses.replace(found[1], values=values)
         if self.update is None:
             found.insert(0, Diagnosis("calibration", WARN, self.state, {}))
         else:
@@ -269,6 +279,9 @@ class CalibrationNode:
         first = next((one for one in self._queue.peek() if not one.is_scan), None)
         if self._info is None or first is None:
             self._waiting_for = "no image with a mask yet" if self._halves else "no image yet"
+            return False
+        if self._point_clock.unsettled:
+            self._waiting_for = self._point_clock.unsettled
             return False
         try:
             if self._geometry is None:
@@ -345,7 +358,8 @@ class CalibrationNode:
         """A message as a frame with one sensor, numbered as it came."""
         if not one.is_scan:
             return Frame(one.number, None, self._image(one, now_ns))
-        scan = scan_of(one.content, one.stamp_ns, self.lidar.topic, self._reading)
+        reading = dataclasses.replace(self._reading, clock=self._point_clock.clock)
+        scan = scan_of(one.content, one.stamp_ns, self.lidar.topic, reading)
         if self._T_cloud_lidar is not None:
             scan = in_lidar_axes(scan, self._T_cloud_lidar)
         return Frame(one.number, scan, None)
@@ -451,7 +465,7 @@ def image_type(topic: str) -> str:
 def _reading(settings: NodeSettings) -> CloudReading:
     timing = None
     if settings.sweep in TURNS:
-        timing = SweepTiming(TURNS[settings.sweep], np.pi, settings.sweep_period_s)
+        timing = SweepTiming(TURNS[settings.sweep], np.pi, settings.sweep_period_s, settings.sweep_stamp)
         if settings.lidar_pose:
             timing = TimingFromCloud.of(timing, parse_lidar_pose(settings.lidar_pose))
     return CloudReading(timing, settings.sweep == "auto", bool(settings.mask_topic))

@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 from sst_graph.classes import MaskEncoding
 from sst_graph.config import Settings, setting, with_overrides
 from sst_graph.data.source import TURNS
 from sst_graph.errors import ConfigError
+from sst_graph.sweep_timing import SweepStamp
 from sst_graph.tracker.config import TrackerConfig
 
 INIT_TF, INIT_NONE = "tf", "none"
@@ -39,6 +40,11 @@ class NodeSettings(Settings):
         doc="Times of the points: auto (those in the clouds), compensated, clockwise, counterclockwise.",
     )
     sweep_period_s: float = setting(0.1, at_least=0.001, at_most=60.0, doc="Duration of a turn.")
+    sweep_stamp: SweepStamp = setting(
+        "forward",
+        choices=get_args(SweepStamp),
+        doc="The instant of a turn that a cloud's stamp names, as --sweep-stamp.",
+    )
     lidar_pose: str = setting(
         "",
         doc="T_cloud_lidar, as --lidar-pose: where the LiDAR is in the axes of the clouds, if these are not "

@@ -16,16 +16,18 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from stored import written
 from streets import SOON
 
 pytest.importorskip("rosbags")
 
 from bags import CAMERA_FRAME, CLOUD, EPOCH_NS, IMAGE, INFO, LIDAR_FRAME, MASK, Messages
+from driver_bags import HALF_S, STREET, Driver, bag_of_driver
 from rosbags.highlevel import AnyReader
 
 import sst_graph.ros_node
 from sst_graph.cli import main
-from sst_graph.data import open_source
+from sst_graph.data import KittiSource, open_source
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.metrics import LINK_FROM_OPTICAL
 from sst_graph.ros_node import CalibrationNode, NodeSettings, Published
@@ -188,6 +190,37 @@ def test_images_stamped_with_the_camera_s_link(bag: Any, config: TrackerConfig) 
     np.testing.assert_allclose((LINK_FROM_OPTICAL.inverse() * linkTl).matrix(), found, atol=1e-8)
     values = {one.key: one.value for one in _diagnostics(node, EPOCH_NS)["camera"].values}
     assert values["axes"].startswith("camera_link shows to be the camera's link (x forward")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("driver", [Driver(True), Driver(True, later_s=2 * HALF_S, arrives_s=0.004)])
+def test_times_of_points_by_the_lidar_s_own_clock(
+    tmp_path: Path, config: TrackerConfig, driver: Driver
+) -> None:
+    """The difference is found from the first ten clouds, which wait; then all is as with times after the
+    stamp."""
+    source = open_source(written(STREET))
+    assert isinstance(source, KittiSource)
+    settings, lines = dataclasses.replace(SETTINGS, sweep="auto"), []
+    for own in (Driver(False), driver):
+        node = CalibrationNode(settings, config)
+        messages = _messages(bag_of_driver(source, tmp_path / str(own.own_clock), own))
+        published = _play(node, messages[:20])
+        assert bool(published) != own.own_clock
+        assert ("scans have told the difference" in node.state) == own.own_clock
+        published += _play(node, messages[20:]) + node.finish(EPOCH_NS)
+        values = {one.key: one.value for one in _diagnostics(node, EPOCH_NS)["lidar"].values}
+        assert ("of another clock" in values.get("times_of_points", "")) == own.own_clock
+        assert values["refused"] == "0" and node.lidar.used == len(source)
+        lines.append(_line(published[-1]))
+    relative, found = lines
+    sigmas = np.sqrt(np.diag(relative["covariance"]))
+    poses = [gtsam.Pose3(np.array(line["T_camera_lidar"])) for line in lines]
+    away = gtsam.Pose3.Logmap(poses[0].between(poses[1]))
+    # With other stamps, other pairs and times between them tell the way along the road, badly.
+    most = 1.0 if driver.later_s else 0.2
+    assert (np.abs(away) < most * sigmas[:6]).all()
+    assert abs(found["time_offset_s"] - relative["time_offset_s"]) < most * sigmas[6]
 
 
 def test_what_is_published_can_be_serialized(bag: Any, config: TrackerConfig) -> None:

@@ -32,8 +32,10 @@ from sst_graph.spread import robust_spread
 from sst_graph.sweep_timing import SweepStamp
 from sst_graph.types import FloatArray
 
-_LOOKED_AT, _COMPARED, _FEWEST = 3, 48, 3
-"""Scans that show whether times are of another clock; most and fewest of those that tell the difference."""
+_LOOKED_AT, _FEWEST = 3, 3
+"""Scans that show whether times are of another clock; fewest of those that tell the difference."""
+COMPARED = 48
+"""Most scans that tell the difference."""
 _MOST_JITTER_S = 0.005
 """Standard deviation of the difference, from scan to scan, above which it tells no time offset."""
 _MOST_DRIFT = 1e-3
@@ -87,12 +89,14 @@ class PointClock:
         since_ns: a stamp.
         reads_ns: what the clock reads at that stamp [ns].
         drift: seconds that it gains a second.
+        named: the instant of a sweep that a scan's stamp counts as.
     """
 
     unit_ns: int
     since_ns: int
     reads_ns: int
     drift: float = 0.0
+    named: SweepStamp = "start"
 
     def at(self, stamp_ns: int) -> int:
         """What it reads at a stamp [ns]."""
@@ -141,7 +145,7 @@ def clock_of_points(
     looked_at = spread(_LOOKED_AT)
     if not any(times.are_far() for times in looked_at):
         return None, ""
-    scans = spread(_COMPARED)
+    scans = spread(COMPARED)
     telling = sum(not tells_nothing(times.values) for times in scans)
     scans = [times for times in scans if times.are_far()]
     if 2 * len(scans) <= telling:
@@ -150,11 +154,11 @@ def clock_of_points(
     unit_ns = max(units, key=lambda unit: units[unit], default=0)
     scans = [times for times in scans if times.unit_ns() == unit_ns]
     if not unit_ns or len(scans) < _FEWEST:
-        return None, f"{_OTHER}; {count_of(len(scans), 'scan')} cannot tell the difference"
+        return None, f"{OTHER_CLOCK}; {count_of(len(scans), 'scan')} cannot tell the difference"
     return _clock(scans, unit_ns, options.sweep_stamp)
 
 
-_OTHER = "times of the points are of another clock than the stamps"
+OTHER_CLOCK = "times of the points are of another clock than the stamps"
 
 
 def _clock(scans: Sequence[ScanTimes], unit_ns: int, stamp: SweepStamp) -> tuple[PointClock | None, str]:
@@ -169,20 +173,20 @@ def _clock(scans: Sequence[ScanTimes], unit_ns: int, stamp: SweepStamp) -> tuple
     # Returns are missing at one end of the sweeps or at the other: the steadier one tells drift and jitter.
     drift, jitter_s = min((_drift(passed, ahead) for ahead in (firsts, lasts)), key=lambda found: found[1])
     if abs(drift) > _MOST_DRIFT:
-        return None, f"{_OTHER}, which runs {1.0 + drift:.4g} times as fast"
+        return None, f"{OTHER_CLOCK}, which runs {1.0 + drift:.4g} times as fast"
     if jitter_s > _MOST_JITTER_S:
-        return None, f"{_OTHER}, whose difference varies by {1e3 * jitter_s:.1f} ms from scan to scan"
+        return None, f"{OTHER_CLOCK}, whose difference varies by {1e3 * jitter_s:.1f} ms from scan to scan"
     named = stamp if stamp != "forward" else _named_instant(scans, float(np.median(lasts - firsts)))
     level = float(np.quantile(firsts - drift * passed, _NEAR_THE_END))
     if named == "end":
         level = float(np.quantile(lasts - drift * passed, 1.0 - _NEAR_THE_END))
-    clock = PointClock(unit_ns, since_ns, since_ns + base_ns + round(level * 1e9), drift)
+    clock = PointClock(unit_ns, since_ns, since_ns + base_ns + round(level * 1e9), drift, named)
     ahead_s = (clock.reads_ns - since_ns) * 1e-9
     facts = f"{abs(ahead_s):.3f} s {'ahead of' if ahead_s > 0.0 else 'behind'} them"
     facts += f", drift {1e6 * drift:.1f} ppm" if drift else ""
     facts += f", jitter {1e3 * jitter_s:.1f} ms"
     convention = f"a stamp counts as the {named} of its sweep (--sweep-stamp start or end)"
-    return clock, f"{_OTHER} ({facts}) and are used by their difference; {convention}"
+    return clock, f"{OTHER_CLOCK} ({facts}) and are used by their difference; {convention}"
 
 
 def _drift(passed: FloatArray, ahead: FloatArray) -> tuple[float, float]:

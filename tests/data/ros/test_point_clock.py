@@ -2,60 +2,34 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.lib import recfunctions
 from numpy.typing import NDArray
 from stored import written
 
 pytest.importorskip("rosbags")
 
-from bags import CLOUD, EPOCH_NS, IMAGE, INFO, MASK, chain, table_of, writing
+from bags import EPOCH_NS, MASK
+from driver_bags import HALF_S, STREET, Driver
+from driver_bags import bag_of_driver as bag
 
 from sst_graph.batch import calibrate
 from sst_graph.cli import main
 from sst_graph.data import KittiSource, open_source
-from sst_graph.data.arrays import read_labels
-from sst_graph.data.images import read_mask
 from sst_graph.data.info.facts import facts_of
-from sst_graph.data.point_times import PointClock, ScanTimes, clock_of_points, seconds_after_stamp
+from sst_graph.data.point_times import (
+    PointClock,
+    ScanTimes,
+    StreamClock,
+    clock_of_points,
+    seconds_after_stamp,
+)
+from sst_graph.data.point_times.clock import OTHER_CLOCK
 from sst_graph.data.source import SourceOptions
 from sst_graph.errors import DataError
-from sst_graph.simulator import SimulationConfig
-
-STREET = SimulationConfig(
-    seed=5, frames=20, width=414, height=125, azimuth_limit_deg=50.0, azimuth_step_deg=0.3,
-    vehicle_density=0.3, moving_fraction=0.0, time_offset_s=0.03, motion="no_stop", speed_mps=6.0,
-    rolling=True,
-)  # fmt: skip
-HALF_S = 0.0144
-"""Of the sweep within 50 deg of forward, where the stamps of the street are."""
-BOOT_NS = EPOCH_NS - 5_000_123_456_789
-"""When the LiDAR's clock began at 0."""
-DRIFT = 30e-6
-
-
-@dataclass(frozen=True)
-class Driver:
-    """How a driver stamps and counts.
-
-    Attributes:
-        own_clock: times of points are seconds of the LiDAR's own clock; else after the stamp.
-        later_s: of the stamp after the start of the sweep.
-        arrives_s: after the stamp.
-        jitter_s: standard deviation of what is added to stamps.
-        lost: every third scan lacks the first third of its returns.
-    """
-
-    own_clock: bool
-    later_s: float = 0.0
-    arrives_s: float = 0.11
-    jitter_s: float = 0.0
-    lost: bool = False
 
 
 @pytest.fixture(scope="module")
@@ -63,37 +37,6 @@ def drive() -> KittiSource:
     source = open_source(written(STREET))
     assert isinstance(source, KittiSource)
     return source
-
-
-def bag(drive: KittiSource, path: Path, driver: Driver) -> Path:
-    rng = np.random.default_rng(0)
-    with writing(path, "mcap") as out:
-        make = out.messages
-        out.add("/tf_static", make.transforms(chain(drive.nominal)), EPOCH_NS)
-        out.add(INFO, make.info(drive.camera), EPOCH_NS)
-        for k in range(len(drive)):
-            scan, image = drive.read_scan(k), drive.read_image(k)
-            assert scan is not None and scan.offsets_s is not None and image is not None
-            labels = read_labels(drive.files.labels[k], len(scan.points))
-            start_ns = EPOCH_NS + scan.stamp_ns - round(HALF_S * 1e9)
-            after_s = scan.offsets_s.astype(np.float64) + HALF_S
-            stamp_ns = start_ns + round((driver.later_s + driver.jitter_s * rng.standard_normal()) * 1e9)
-            times = after_s - (stamp_ns - start_ns) * 1e-9
-            if driver.own_clock:
-                times = (start_ns - BOOT_NS) * 1e-9 * (1.0 + DRIFT) + after_s
-            table = recfunctions.append_fields(
-                recfunctions.repack_fields(recfunctions.drop_fields(table_of(scan, labels), "time")),
-                "timestamp",
-                times,
-                usemask=False,
-            )
-            if driver.lost and k % 3 == 1:
-                table = table[after_s > 0.01]
-            out.add(CLOUD, make.cloud(stamp_ns, table), stamp_ns + round(driver.arrives_s * 1e9))
-            stamp_ns = EPOCH_NS + image.stamp_ns
-            out.add(IMAGE, make.image(stamp_ns, image.pixels), stamp_ns)
-            out.add(MASK, make.image(stamp_ns, read_mask(drive.files.masks[k]), "mono8"), stamp_ns)
-    return path
 
 
 def times_of(path: Path) -> list[NDArray[np.float64]]:
@@ -294,3 +237,45 @@ def test_a_bag_rewritten_by_its_stamps_does_not_tell_what_they_name(
     assert "a stamp counts as the start of its sweep" in remarks(path)
     # Times of recording as stamps: the sweep is over by then.
     assert "a stamp counts as the end of its sweep" in remarks(path, stamps="received")
+
+
+def test_the_clock_of_a_stream() -> None:
+    """It is known from the tenth scan on, follows a drift for hours, and outlives a bag that begins again."""
+    drift, stream = 5e-5, StreamClock()
+    for k in range(3000):
+        passed = 1.7 * k
+        stamp_ns = EPOCH_NS + round(passed * 1e9)
+        values = 40.0 + (1.0 + drift) * passed + SWEEP
+        stream.add(stamp_ns, values, stamp_ns + 110_000_000)
+        if k < 9:
+            assert stream.unsettled == f"{OTHER_CLOCK}: {k + 1} of 10 scans have told the difference yet"
+            continue
+        assert stream.unsettled == "" and "as the start of its sweep" in stream.words
+        seconds = seconds_after_stamp(values, stamp_ns, stream.clock)
+        assert seconds is not None
+        np.testing.assert_allclose(seconds, SWEEP, atol=1e-4)
+    before = stream.clock
+    stream.add(EPOCH_NS, 40.0 + SWEEP, EPOCH_NS)
+    assert stream.clock is before and stream.clock is not None
+    seconds = seconds_after_stamp(40.0 + SWEEP, EPOCH_NS, stream.clock)
+    assert seconds is not None and np.abs(seconds - SWEEP).max() < 0.01
+
+
+def test_what_stamps_name_is_found_once_in_a_stream() -> None:
+    """Messages that come later than at first do not move the points by a sweep."""
+    stream = StreamClock()
+    for k in range(200):
+        stamp_ns, late_ns = EPOCH_NS + k * 100_000_000, 5_000_000 if k < 20 else 150_000_000
+        values = 37.0 + 0.1 * k + SWEEP
+        stream.add(stamp_ns, values, stamp_ns + late_ns)
+        if k >= 9:
+            seconds = seconds_after_stamp(values, stamp_ns, stream.clock)
+            assert seconds is not None
+            np.testing.assert_allclose(seconds, SWEEP - 0.1, atol=1e-5)
+
+
+def test_a_stream_by_the_clock_of_its_stamps() -> None:
+    stream = StreamClock()
+    for values in (None, np.zeros(9), SWEEP, EPOCH_NS * 1e-9 + SWEEP):
+        stream.add(EPOCH_NS, values, EPOCH_NS)
+        assert (stream.clock, stream.words, stream.unsettled) == (None, "", "")
