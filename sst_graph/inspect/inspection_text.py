@@ -209,7 +209,8 @@ def _sigma_block(inspection: Inspection) -> list[str]:
 
 
 def _correlation_block(inspection: Inspection) -> list[str]:
-    lines = [f"{'correlation':<12}" + "".join(f"{name:>8}" for name in SHORT)]
+    lines = ["correlation, about and along the LiDAR's axes"]
+    lines.append(f"{'':<12}" + "".join(f"{name:>8}" for name in SHORT))
     for name, row in zip(SHORT, inspection.correlation, strict=True):
         lines.append(f"{name:<12}" + "".join(f"{value:>+8.2f}" for value in row))
     lines += [f"- {correlation_sentence(pair)}" for pair in inspection.strong[:MOST_SENTENCES]]
@@ -241,7 +242,7 @@ def _frame_block(inspection: Inspection, all_frames: bool) -> list[str]:
     shown = sorted(order if all_frames or len(frames) <= MOST_FRAMES else order[:MOST_FRAMES])
     left_out = len(frames) - len(shown)
     lines = [
-        "what each frame brings: bits it adds to all the others; sigma without it over sigma with it"
+        "what each frame brings: bits it adds to the others; sigma (LiDAR's axes) without it over with it"
         + (f" (the {MOST_FRAMES} that add most; {left_out} more with --all-frames)" if left_out else ""),
         f"{'frame':<16}{'bits':>7}"
         + "".join(f"{name:>8}" for name in SHORT)
