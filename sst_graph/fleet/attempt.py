@@ -15,6 +15,7 @@ from sst_graph.errors import DataError, SstGraphError, printable
 from sst_graph.files import MANIFEST
 from sst_graph.files.manifest import read_manifest
 from sst_graph.files.staging import SUFFIX, claim
+from sst_graph.fleet.drive_files import fingerprint, size_of
 from sst_graph.fleet.drives import ListedDrive
 from sst_graph.fleet.isolated import Ending, Limits, has_ended, run_isolated
 from sst_graph.fleet.places import Place
@@ -78,7 +79,8 @@ class Job:
 def run_drive(job: Job) -> Record:
     """Calibrate one drive, again after a crash or a kill, and write its record. Never raises for the drive.
 
-    A result that stands there whole, as of a task that a scheduler repeats, is taken as it is.
+    A result that stands there whole, as of a task that a scheduler repeats, is taken as it is, unless the
+    drive's files have changed.
     """
     record = finished_record(job)
     attempts = kills = 0
@@ -108,7 +110,7 @@ def _is_to_be_repeated(status: Status, has_retries: bool, kills: int) -> bool:
 
 
 def finished_record(job: Job, stored: bytes | None = None) -> Record | None:
-    """The record of a drive whose result stands there whole, or None.
+    """The record of a drive whose result stands there whole and is of its files as they are, or None.
 
     A record is written after the result. Where it is missing (the batch was killed between the two), it is
     made from the result, and written.
@@ -124,7 +126,7 @@ def finished_record(job: Job, stored: bytes | None = None) -> Record | None:
                 and Place(record.place).whole(job.folder) == job.place
                 and _is_whole(job, stored is not None)
             ):
-                return record
+                return None if has_changed(job, record) else record
         if not (job.result / MANIFEST).exists():
             return None
         if job.result.is_local:
@@ -137,6 +139,13 @@ def finished_record(job: Job, stored: bytes | None = None) -> Record | None:
     if made is not None:
         _write_record(job, made)
     return made
+
+
+def has_changed(job: Job, record: Record) -> bool:
+    """Whether the drive's files on this machine are others than those that an earlier result is of; not where
+    they are gone, or were fetched."""
+    now = fingerprint(Path(job.place)) if job.drive.place.is_local and record.files else ""
+    return now not in ("", record.files)
 
 
 def _is_whole(job: Job, is_there: bool) -> bool:
@@ -162,12 +171,13 @@ def _attempt_in(scratch: Path, job: Job) -> Record:
     except (SstGraphError, OSError) as error:
         return _failed(job, "storage", str(error))
     local = job.result.path if job.result.is_local else scratch / "result"
+    files = fingerprint(data) if job.drive.place.is_local else ""
     try:
         ending = _calibrated(job, data, local)
     except OSError as error:
         status: Status = "storage" if error.errno in _FULL else "crash"
         return _failed(job, status, f"no process could be started: {error}")
-    cost = Cost(1, ending.wall_s, ending.cpu_s, ending.peak_bytes, _size(data))
+    cost = Cost(1, ending.wall_s, ending.cpu_s, ending.peak_bytes, size_of(data))
     if ending.limit or ending.code not in (_EXIT_DONE, _EXIT_NOT_TRUSTED):
         if not has_ended():  # who ends a batch cleans up after all of its drives
             _clean(local)
@@ -180,7 +190,7 @@ def _attempt_in(scratch: Path, job: Job) -> Record:
             job.result.upload(local)
         except (SstGraphError, OSError) as error:
             return replace(_failed(job, "storage", str(error)), cost=cost)
-    return replace(record, cost=cost)
+    return replace(record, cost=cost, files=files)
 
 
 def _data(job: Job, scratch: Path) -> Path:
@@ -269,15 +279,3 @@ def remove_unfinished(out: Place) -> None:
         found = (_UNFINISHED.match(name) for name in os.listdir(folder.url))
         for name in {one[1] for one in found if one is not None}:
             _clean(folder.path / name)
-
-
-def _size(path: Path) -> int:
-    """Bytes of a file, or of all files in a folder."""
-    if path.is_file():
-        return path.stat().st_size
-    total = 0
-    for folder, _, names in os.walk(path):
-        for name in names:
-            with contextlib.suppress(OSError):
-                total += os.stat(os.path.join(folder, name)).st_size
-    return total

@@ -24,7 +24,15 @@ from sst_graph.files.json_table import json_table
 from sst_graph.files.reading import FileKind, digest_of_file
 from sst_graph.files.staging import lock_file, sweep_folder
 from sst_graph.files.strict_json import strict_json
-from sst_graph.fleet.attempt import DRIVES, RECORDS, Job, finished_record, remove_unfinished, run_drive
+from sst_graph.fleet.attempt import (
+    DRIVES,
+    RECORDS,
+    Job,
+    finished_record,
+    has_changed,
+    remove_unfinished,
+    run_drive,
+)
 from sst_graph.fleet.dask_pool import run_on_dask
 from sst_graph.fleet.drives import ListedDrive, checked_drives, vehicle_files
 from sst_graph.fleet.isolated import Limits
@@ -83,6 +91,7 @@ class Progress:
         without_result: how many failed so far.
         seconds: since this run began.
         last: the drive that was done last, or None.
+        changed: how many drives are run again, because their files have changed since an earlier run.
     """
 
     done: int
@@ -91,6 +100,7 @@ class Progress:
     without_result: int
     seconds: float
     last: Record | None = None
+    changed: int = 0
 
     @property
     def per_hour(self) -> float:
@@ -230,11 +240,11 @@ def run_batch(
     checked_type("progress", progress, Callable, "a function of the Progress")  # type: ignore[arg-type]
     checked_type("run", run, Callable, "a function of a Job")  # type: ignore[arg-type]
     jobs = [Job(drive, config.options, out, os.getcwd(), config.limits, config.retries) for drive in drives]
-    records = _finished(jobs, out)
+    records, changed = _finished(jobs, out)
     left = [job for job in jobs if job.drive.name not in records]
     earlier, started = len(records), time.monotonic()
     failed = 0
-    progress(Progress(earlier, len(jobs), earlier, failed, 0.0))
+    progress(Progress(earlier, len(jobs), earlier, failed, 0.0, changed=changed))
     if config.dask and left:
         coming = run_on_dask(left, config.dask, config.workers, run)
     else:
@@ -298,36 +308,43 @@ def _others(drives: Sequence[ListedDrive], out: Place) -> int:
     return sum(place.name not in given for place in there)
 
 
-def _finished(jobs: Sequence[Job], out: Place) -> dict[str, Record]:
-    """The records of drives whose results stand there whole."""
+def _finished(jobs: Sequence[Job], out: Place) -> tuple[dict[str, Record], int]:
+    """The records of drives whose results stand there whole, and how many have changed since."""
     folder = out / DRIVES
     if not folder.exists():
-        return {}
+        return {}, 0
     there = {place.name for place in folder.below()}
     begun = [job for job in jobs if job.drive.name in there]
     stored = read_many(out / RECORDS / f"{job.drive.name}.json" for job in begun)
-    found = {}
+    found, changed = {}, 0
     for job in begun:
         data = stored.get(job.record)
-        _check_same(job, data)
-        record = finished_record(job, data)
-        if record is not None:
+        before = _before(job, data)
+        if (record := finished_record(job, data)) is not None:
             found[job.drive.name] = record
-    return found
+        else:
+            changed += before is not None and has_changed(job, before)
+    return found, changed
 
 
-def _check_same(job: Job, data: bytes | None) -> None:
+def _before(job: Job, data: bytes | None) -> Record | None:
+    """What an earlier run made of a drive; None where that is not known, and is written anew.
+
+    Raises:
+        ConfigError: it is of other data.
+    """
     if data is None:
-        return
+        return None
     try:
         before = Record.from_json(data, job.record.url)
     except DataError:
-        return  # it is written anew
+        return None
     if before.has_result and Place(before.place).whole(job.folder) != job.place:
         raise ConfigError(
             f"{job.place}: found a result of {before.place} under the name {job.drive.name}, "
             "expected one of the same data (names differ with --name-parts 2, or another --out)"
         )
+    return before
 
 
 @contextmanager

@@ -135,6 +135,7 @@ class Record:
         cost: what it took.
         numbers: of the result, or None.
         log: last lines of what a failed attempt wrote on stderr.
+        files: fingerprint of the drive's files that the result is of; empty where it is not known.
     """
 
     drive: str
@@ -144,6 +145,7 @@ class Record:
     cost: Cost = Cost()
     numbers: Numbers | None = None
     log: tuple[str, ...] = ()
+    files: str = ""
 
     @property
     def has_result(self) -> bool:
@@ -198,6 +200,7 @@ class Record:
             spent,
             numbers,
             table.sentences("log"),
+            table.text("files", ""),
         )
 
 

@@ -293,6 +293,31 @@ def test_from_s3_to_s3(drives: Path, tmp_path: Path, s3: str, monkeypatch: pytes
 
 
 @pytest.mark.slow
+def test_a_drive_whose_files_have_changed_is_run_again(
+    drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Of a result that was made of other files nothing says so; data that are gone change nothing."""
+    out, one = tmp_path / "out", drives / "v1_2026-03-01"
+    command = ["batch", str(drives / "v1_*"), "--out", str(out), "--workers", "1", *FAST]
+    assert main(command) == 3
+    before = results(out / "drives")
+    calib = next(one.rglob("calib.txt"))
+    *others, last = calib.read_text().rstrip().split(" ")
+    calib.write_text(" ".join([*others, f"{float(last) + 0.01:.6f}\n"]))
+    capfd.readouterr()
+    assert main(command) == 3
+    said = capfd.readouterr().err
+    assert "2 drives, 1 of them done by an earlier run, 1 run again, for their files have changed" in said
+    after = results(out / "drives")
+    changed = {Path(name).parts[0] for name in before if before[name] != after[name]}
+    assert changed == {one.name}
+    shutil.rmtree(one)
+    assert main(["batch", str(drives / "v1_*"), "--out", str(out), "--workers", "1", *FAST]) == 3
+    assert "files have changed" not in capfd.readouterr().err
+    assert results(out / "drives") == after
+
+
+@pytest.mark.slow
 def test_on_dask(drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("distributed")
     out = tmp_path / "out"

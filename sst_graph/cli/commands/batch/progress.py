@@ -33,6 +33,8 @@ class ProgressOnStderr:
     def __call__(self, progress: Progress) -> None:
         """Show where the batch stands; name a drive that failed."""
         if sys.stderr.isatty():
+            if self._bar is None and progress.changed:
+                complain(first_line(progress))
             self._draw(progress)
         elif self._said is None or time.monotonic() - self._said > _LINE_EVERY_S:
             begun = self._said is None
@@ -70,7 +72,8 @@ def on_terminal(drive: str, reason: str) -> str:
 def first_line(progress: Progress) -> str:
     """What there is to do, in words."""
     earlier = f", {progress.earlier} of them done by an earlier run" if progress.earlier else ""
-    return f"{count_of(progress.total, 'drive')}{earlier}"
+    again = f", {progress.changed} run again, for their files have changed" if progress.changed else ""
+    return f"{count_of(progress.total, 'drive')}{earlier}{again}"
 
 
 def progress_line(progress: Progress) -> str:

@@ -1,0 +1,57 @@
+"""When the files of a drive count as changed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from sst_graph.fleet.drive_files import fingerprint, size_of
+
+
+def drive(folder: Path) -> Path:
+    (folder / "scans").mkdir(parents=True)
+    (folder / "scans" / "0.bin").write_bytes(bytes(160))
+    (folder / "calib.txt").write_text("Tr: 1.25")
+    return folder
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda folder: (folder / "calib.txt").write_text("Tr: 1.35"),
+        lambda folder: (folder / "scans" / "0.bin").write_bytes(bytes(176)),
+        lambda folder: (folder / "scans" / "1.bin").write_bytes(b""),
+        lambda folder: (folder / "scans" / "0.bin").rename(folder / "scans" / "1.bin"),
+    ],
+    ids=["a number", "a size", "one more", "a name"],
+)
+def test_a_change_shows(tmp_path: Path, change: Callable[[Path], object]) -> None:
+    folder = drive(tmp_path / "a")
+    before = fingerprint(folder)
+    assert before == fingerprint(drive(tmp_path / "b")) != ""
+    change(folder)
+    assert fingerprint(folder) != before
+
+
+def test_what_is_no_change(tmp_path: Path) -> None:
+    folder = drive(tmp_path / "a")
+    before = fingerprint(folder)
+    os.utime(folder / "calib.txt", (0, 0))
+    (folder / ".cache").mkdir()
+    (folder / ".cache" / "x.txt").write_text("x")
+    (folder / "gone").symlink_to(folder / "nowhere")
+    assert fingerprint(folder) == before
+    assert size_of(folder) == 160 + 8 + 1
+
+
+def test_one_file_and_none(tmp_path: Path) -> None:
+    bag = tmp_path / "drive.mcap"
+    assert fingerprint(bag) == "" and size_of(bag) == 0
+    bag.write_bytes(b"123")
+    before = fingerprint(bag)
+    assert before != "" and size_of(bag) == 3
+    bag.write_bytes(b"1234")
+    assert fingerprint(bag) != before
