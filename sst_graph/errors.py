@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ __all__ = [
     "SstGraphError",
     "count_of",
     "first_line",
+    "in_file",
     "one_line",
     "optional_module",
     "printable",
@@ -40,6 +43,17 @@ class DataError(SstGraphError):
 
     def __reduce__(self) -> tuple[type[DataError], tuple[str, str, str]]:
         return type(self), (self.place, self.found, self.expected)
+
+
+@contextmanager
+def in_file(file: str | Path) -> Iterator[None]:
+    """Name ``file`` before the place of a :class:`DataError` that does not name it."""
+    try:
+        yield
+    except DataError as error:
+        if error.place.startswith(printable(file, _MAX_PART)):
+            raise
+        raise type(error)(f"{file}: {error.place}", error.found, error.expected) from error
 
 
 class CheckpointError(DataError):

@@ -17,7 +17,7 @@ from typing import Any, Literal, cast, get_args
 import gtsam
 import numpy as np
 
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, in_file
 from sst_graph.factors.arguments import (
     as_numbers,
     checked_gtsam,
@@ -275,7 +275,7 @@ class CalibrationResult:
         reader = json_table(parse_json(text, place, CALIBRATION.name), place, FORMAT, VERSION)
         camera = reader.table("camera")
         initial = None if reader.value("initial", None) is None else reader.table("initial")
-        try:
+        with in_file(place):
             return CalibrationResult(
                 T_camera_lidar=reader.pose("T_camera_lidar"),
                 time_offset_s=reader.time_offset_s("time_offset_s"),
@@ -303,10 +303,6 @@ class CalibrationResult:
                 diagnostics=reader.mapping("diagnostics"),
                 versions=_versions(reader),
             )
-        except DataError as error:
-            if error.place.startswith(str(place)):
-                raise
-            raise DataError(f"{place}: {error.place}", error.found, error.expected) from error
 
 
 def read_result(path: str | Path) -> CalibrationResult:

@@ -46,6 +46,8 @@ _LOG = logging.getLogger(__name__)
 
 _LEAST_FREEDOM = 8
 """Least degrees of freedom of Student's t: each object has several sides, and the error model has a floor."""
+_FARTHEST_TAIL = 20.0
+"""Threshold of which Student's t is compared with the normal distribution at most: a tail of 3e-89."""
 _ALL_FREE_KERNELS_PX = (20.0, 10.0, 5.0, 3.0, 3.0, 3.0)
 """Kernel scales of the solution with all parameters free, outer iteration by outer iteration [px]. It need
 not converge: the linear step to one parameter's estimate covers the rest.
@@ -358,6 +360,8 @@ def few_objects_factor(objects: int, threshold: float) -> float:
     objects, and the estimate over its deviation follows Student's t rather than the normal distribution
     (Cameron and Miller, A practitioner's guide to cluster-robust inference, 2015).
     """
+    # The tail of a higher threshold is no number any more; its rate of false alarms is nothing.
+    threshold = min(threshold, _FARTHEST_TAIL)
     tail = float(ndtr(-threshold))
     return -float(stdtrit(max(objects - 1, _LEAST_FREEDOM), tail)) / threshold
 

@@ -6,9 +6,12 @@ from collections.abc import Iterable, Sequence
 from itertools import islice
 from typing import Any
 
+import gtsam
 import numpy as np
 
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, one_line
+from sst_graph.factors.arguments import described
+from sst_graph.files.checked_values import checked_text
 from sst_graph.types import Source
 from sst_graph.validation import checked_intrinsics
 
@@ -33,10 +36,29 @@ def as_sources(frames: Source | Sequence[Source]) -> list[Source]:
     if len(sources) > _MOST:
         raise DataError("frames to calibrate", f"more than {_MOST} drives", "so many at most")
     for source in sources:
-        if len(source) == 0:
-            raise DataError(source.name, "no frame", "one or more")
-        checked_intrinsics(source.camera, f"{source.name}: camera")
+        _check_source(source)
     return sources
+
+
+def _check_source(source: Any) -> None:
+    """What any source says of itself: its name, which results are written with, its length and its camera.
+
+    Raises:
+        DataError: one of these is none.
+    """
+    name = source.name
+    if not isinstance(name, str):
+        raise DataError(f"a {type(source).__name__}: name", described(name), "text")
+    checked_text(name, f"a {type(source).__name__}: name")
+    try:
+        count = len(source)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise DataError(f"{name}: length", one_line(error), "a number of frames") from error
+    if count == 0:
+        raise DataError(name, "no frame", "one or more")
+    checked_intrinsics(source.camera, f"{name}: camera")
+    if not isinstance(source.nominal, gtsam.Pose3 | None):
+        raise DataError(f"{name}: nominal", described(source.nominal), "a gtsam.Pose3, or None")
 
 
 def _is_source(value: Any) -> bool:

@@ -71,6 +71,10 @@ def run(argv: Sequence[str], own_process: bool = False, tells_apart: bool = Fals
             name, place = of_loader
             words = f"in the loader {name}: {_named(error)} ({place}; --verbose shows all)"
             return _failed(words, EXIT_BAD_INPUT)
+        package = _imported_package(error)
+        if package is not None:
+            advice = "is it installed whole, and are the variables of the environment right?"
+            return _failed(f"{package} does not load: {_named(error)}{_where(error)}: {advice}", defect)
         return _failed(_unexpected(error), defect)
 
 
@@ -81,9 +85,22 @@ def _named(error: Exception) -> str:
 
 def _unexpected(error: Exception) -> str:
     """What nobody foresaw, on one line: a defect of this program."""
+    return f"unexpected {_named(error)}{_where(error)} (a defect, please report it with what --verbose says)"
+
+
+def _where(error: Exception) -> str:
+    """The line that raised an exception, with ``at`` before it."""
     steps = traceback.extract_tb(error.__traceback__)
-    where = f" at {os.path.basename(steps[-1].filename)}:{steps[-1].lineno}" if steps else ""
-    return f"unexpected {_named(error)}{where} (a defect, please report it with what --verbose says)"
+    return f" at {os.path.basename(steps[-1].filename)}:{steps[-1].lineno}" if steps else ""
+
+
+def _imported_package(error: Exception) -> str | None:
+    """The package of others whose import raised an exception; None where no such import was under way."""
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        package = str(frame.f_globals.get("__name__", "")).partition(".")[0]
+        if frame.f_code.co_name == "<module>" and package not in ("sst_graph", "factors"):
+            return package
+    return None
 
 
 def _run(argv: Sequence[str], own_process: bool) -> int:

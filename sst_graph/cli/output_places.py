@@ -13,7 +13,11 @@ from sst_graph.files import OutputFileKind
 RESULT_FILE = OutputFileKind("a calibration.json", lambda head: b'"sst-graph/calibration"' in head)
 CHECKPOINT_FILE = OutputFileKind("a checkpoint of the tracker", lambda head: b"head.npy" in head[:64])
 RERUN_FILE = OutputFileKind("a recording of rerun", lambda head: head.startswith(b"RRF"))
-PNG_FILE = OutputFileKind("a PNG", lambda head: head.startswith(b"\x89PNG\r\n"))
+PICTURE_SOFTWARE = b"Software\0sst-graph"
+"""Text in the PNGs that are written, by which they are told from the pictures of a drive."""
+PNG_FILE = OutputFileKind(
+    "a PNG that sst-graph wrote", lambda head: head.startswith(b"\x89PNG\r\n") and PICTURE_SOFTWARE in head
+)
 
 _NO_PATHS = ("dataset", "none", "initial")
 """Choices of ``--init`` and ``--before`` that are no files."""

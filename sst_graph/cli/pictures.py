@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import struct
+import zlib
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -15,6 +17,7 @@ from numpy.typing import NDArray
 
 from sst_graph.cameras.estimated_camera import EstimatedCamera
 from sst_graph.cli.drive_odometry import DriveOdometry
+from sst_graph.cli.output_places import PICTURE_SOFTWARE
 from sst_graph.data.frame_parts import RecentReader, image_positions, scan_positions
 from sst_graph.errors import DataError, count_of
 from sst_graph.factors.camera import PinholeCamera
@@ -27,6 +30,9 @@ from sst_graph.result import CalibrationResult
 from sst_graph.sampling import evenly_spread
 from sst_graph.types import CameraImage, FloatArray, Frame, Scan, SemanticClass, Source
 from sst_graph.viz import Placement, draw_placement, stacked
+
+_PNG_HEADER = 33
+"""Bytes of a PNG's signature and of its first chunk, IHDR; texts may follow."""
 
 
 def position_of(drive: RecentReader, index: int) -> int:
@@ -159,9 +165,11 @@ def close_words(after: ClosePoints | None, before: ClosePoints | None) -> str:
 
 
 def png(picture: NDArray[np.uint8]) -> bytes:
-    """The picture (h, w, 3) BGR as the bytes of a PNG file."""
-    _, data = cv2.imencode(".png", picture)
-    return bytes(data)
+    """The picture (h, w, 3) BGR as the bytes of a PNG file that names this program."""
+    data = bytes(cv2.imencode(".png", picture)[1])
+    content = b"tEXt" + PICTURE_SOFTWARE
+    chunk = struct.pack(f">I{len(content)}sI", len(PICTURE_SOFTWARE), content, zlib.crc32(content))
+    return data[:_PNG_HEADER] + chunk + data[_PNG_HEADER:]
 
 
 def _at_true_time(drive: RecentReader, position: int, time_offset_s: float) -> tuple[Frame, bool]:

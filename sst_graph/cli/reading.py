@@ -193,10 +193,8 @@ def _check_given(args: argparse.Namespace, stored: Mapping[str, Any], place: Pat
         if given is None or name not in stored or given == stored[name]:
             continue
         if name in PAIRING:
-            raise ConfigError(
-                f"{_flag(name)} {given}: {place} was made with {_flag(name)} {stored[name]}, "
-                "expected the same"
-            )
+            own = f"without {_flag(name)}" if stored[name] is None else f"with {_flag(name)} {stored[name]}"
+            raise ConfigError(f"{_flag(name)} {given}: {place} was made {own}, expected the same")
         complain(f"warning: {place} was made with {_flag(name)} {stored[name]}, found {_flag(name)} {given}")
 
 

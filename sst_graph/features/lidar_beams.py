@@ -45,6 +45,10 @@ leave less than 0.005 of it for spinning scanners, 0.2 to 0.55 seen from the veh
 where they are random."""
 _COMPARED, _LEAST_RANGE_M = 3_000, 0.5
 """Points that are compared so, about, and how far away they are: returns that were lost are at the origin."""
+_COMPARED_OF_EACH = 16
+"""Points of each laser among these, about: any three lie in a plane."""
+_MOST_LASERS = 2_048
+"""No scanner has as many. More numbers are those of something else, such as columns or returns."""
 _FLAT = 1e-6
 """Variance of directions across a plane, of a milliradian, in which all lie."""
 _LEAST_GAP = 1e-5
@@ -114,9 +118,12 @@ def rings_belong(points: FloatArray, rings: NDArray[np.integer]) -> bool:
     The directions in which one laser measures lie on a cone, and their unit vectors in a plane, whatever the
     axes. How far off such planes they are is compared with how far off one plane all of them are.
     """
+    lasers = int(np.count_nonzero(np.bincount(rings))) if len(rings) else 0
+    if lasers > _MOST_LASERS:
+        return False
     # An odd step: columns of a file have an even number of lasers.
-    some = points[:: step_for(len(points), _COMPARED) | 1]
-    numbers = rings[:: step_for(len(points), _COMPARED) | 1]
+    step = step_for(len(points), max(_COMPARED, _COMPARED_OF_EACH * lasers)) | 1
+    some, numbers = points[::step], rings[::step]
     ranges = np.linalg.norm(some, axis=1)
     seen = np.isfinite(ranges) & (ranges > _LEAST_RANGE_M)
     some, numbers, ranges = some[seen], numbers[seen], ranges[seen]

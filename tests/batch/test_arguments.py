@@ -85,6 +85,31 @@ def test_a_source_without_a_camera(drive: KeptDrive, camera: Any) -> None:
         calibrate(dataclasses.replace(drive, camera=camera))
 
 
+@pytest.mark.parametrize(
+    ("said", "message"),
+    [
+        ({"name": 5}, "name: found 5, expected text"),
+        ({"name": {}}, "name: found a dict, expected text"),
+        ({"name": "a\nb"}, "expected text without control characters"),
+        ({"nominal": "Tr"}, "nominal: found the text 'Tr', expected a gtsam.Pose3"),
+        ({"frames": ()}, "found no frame"),
+    ],
+)
+def test_what_a_source_says_of_itself(drive: KeptDrive, said: dict[str, Any], message: str) -> None:
+    with pytest.raises(SstGraphError, match=re.escape(message)):
+        calibrate(dataclasses.replace(drive, **said))
+
+
+@pytest.mark.parametrize("length", ["three", -1, 10**30])
+def test_a_source_whose_length_is_none(drive: KeptDrive, length: Any) -> None:
+    class Endless(KeptDrive):
+        def __len__(self) -> int:
+            return length  # type: ignore[no-any-return]
+
+    with pytest.raises(SstGraphError, match=f"{drive.name}: length: found .*, expected a number of frames"):
+        calibrate(Endless.of(drive))
+
+
 @pytest.mark.parametrize("method", ["auto", "joint", "motion", "edges"])
 @pytest.mark.parametrize("part", ["frame", "index", "scan", "points", "image", "mask"])
 def test_a_source_whose_frames_hold_anything(drive: KeptDrive, part: str, method: Any) -> None:

@@ -273,6 +273,10 @@ def test_a_wider_assumption_gives_a_wider_covariance(clean: CalibrationResult) -
 def test_few_objects_raise_the_deviation() -> None:
     assert few_objects_factor(1000, 3.3) == pytest.approx(1.0, abs=0.01)
     assert few_objects_factor(9, 3.3) == few_objects_factor(3, 3.3) > few_objects_factor(20, 3.3) > 1.1
+    # Up to the highest threshold that the settings allow.
+    for objects in (3, 20, 1000):
+        factors = [few_objects_factor(objects, each) for each in (1.0, 3.3, 10.0, 20.0, 37.0, 100.0)]
+        assert np.isfinite(factors).all() and factors == sorted(factors) and factors[0] >= 1.0
 
 
 @pytest.mark.parametrize(

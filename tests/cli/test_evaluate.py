@@ -195,7 +195,12 @@ def test_overlay_replaces_only_with_overwrite(
     assert main(command) == 2
     assert "--overwrite" in capsys.readouterr().err and out.read_bytes() == b"mine"
     assert main([*command, "--overwrite"]) == 2
-    assert "expected a PNG to overwrite" in capsys.readouterr().err and out.read_bytes() == b"mine"
+    assert "expected a PNG that sst-graph wrote to overwrite" in capsys.readouterr().err
+    assert out.read_bytes() == b"mine"
+    # Nor a picture of the drive.
+    out.write_bytes(picture := next(kitti_drive.rglob("image_2/*.png")).read_bytes())
+    assert main([*command, "--overwrite"]) == 2
+    assert "another kind of file" in capsys.readouterr().err and out.read_bytes() == picture
     out.unlink()
     assert main(command) == 0
     assert main([*command, "--overwrite", "--before", "dataset"]) == 0

@@ -205,7 +205,7 @@ def test_where_matplotlib_does_not_start(tmp_path: Path, result: CalibrationResu
     [
         (None, [], "no such file"),
         ({}, ["--next", "0"], "--next 0: expected 1 or more"),
-        ({KEY: 3}, [], "frame_information: found int"),
+        ({KEY: 3}, [], "calibration.json: diagnostics.frame_information: found int"),
         ({KEY: {"drive": ["a"], "frame": [1]}}, [], "frame_information.bits"),
     ],
 )

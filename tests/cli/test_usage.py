@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from importlib.metadata import version
@@ -63,6 +64,9 @@ def test_help_states_sign_and_direction() -> None:
         (["evaluate", "x"], "the following arguments are required: --truth"),
         (["simulate", "x", "--frames", "many"], "argument --frames: invalid int value: 'many'"),
         (["simulate", "x", "--time-offset", "1,5"], "argument --time-offset: invalid float value: '1,5'"),
+        (["evaluate", "x", "--truth=--"], "argument --truth: found --, expected a value"),
+        (["info", "x", "--camera=--"], "argument --camera: found --, expected a value"),
+        (["calibrate", "x", "--camera=--"], "argument --camera: found --, expected a value"),
     ],
 )
 def test_usage_errors_are_one_line(
@@ -88,6 +92,19 @@ def test_bad_input_from_the_shell(tmp_path: Path) -> None:
         done.stderr
         == f"sst-graph: error: {tmp_path}/none.json: found no such file, expected a calibration.json\n"
     )
+
+
+def test_a_package_of_others_that_does_not_load(tmp_path: Path) -> None:
+    (tmp_path / "scipy.py").write_text("raise OSError('libx.so: cannot open shared object file')\n")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    command = [sys.executable, "-m", "sst_graph", "inspect", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=60, check=False)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert "libx.so: cannot open shared object file" in done.stderr and "defect" not in done.stderr
+    (tmp_path / "scipy.py").write_text("int('abc')\n")
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=60, check=False)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert "error: scipy does not load: ValueError: invalid literal" in done.stderr
 
 
 def test_a_closed_pipe_is_no_crash(tmp_path: Path) -> None:

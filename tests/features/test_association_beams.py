@@ -151,3 +151,15 @@ def test_rings_of_few_points_among_rings_of_many() -> None:
         for p in (points[kept & (rank == r)] for r in range(8))
     ]
     np.testing.assert_allclose(beams.elevation, medians, atol=1e-3)
+
+
+def test_more_numbers_than_lasers_are_those_of_something_else() -> None:
+    """Of a number that one point or two have, nothing is left of the variance, whatever it stands for."""
+    points, _ = eight_rings(low_m=15.0)
+    points = np.tile(points, (1 + 20_000 // len(points), 1))
+    rng = np.random.default_rng(6)
+    for most in (500, 65_536):
+        numbers = rng.integers(0, most, len(points)).astype(np.uint16)
+        assert not rings_belong(points, numbers)
+        recovered = arrange_beams(points, None)
+        np.testing.assert_array_equal(arrange_beams(points, numbers).ring, recovered.ring)

@@ -12,7 +12,7 @@ from sst_graph.cli.options import SOURCE_DEFAULTS
 from sst_graph.cli.output_places import check_apart
 from sst_graph.cli.progress import ProgressBar
 from sst_graph.cli.reading import checked_options, open_drive_of, reading_words
-from sst_graph.errors import ConfigError
+from sst_graph.errors import ConfigError, in_file
 from sst_graph.files import OutputKind, atomic_directory
 from sst_graph.fit import MeasuredFit
 from sst_graph.inspect.inspection import Inspection, inspect_result, to_dict
@@ -57,7 +57,8 @@ def run(args: argparse.Namespace) -> int:
 def _inspected(args: argparse.Namespace) -> tuple[Inspection, MeasuredFit | None]:
     """The inspection, and the fit to ``args.data`` where that was given."""
     result = result_with_information(args.result)
-    inspection = inspect_result(result, args.next)
+    with in_file(result_file(args.result)):
+        inspection = inspect_result(result, args.next)
     if args.data is None:
         return inspection, None
     # What measures a drive brings all that calibrates one; without a drive nothing waits for it.

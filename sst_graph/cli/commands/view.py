@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from contextlib import ExitStack
 
 import numpy as np
@@ -13,9 +14,9 @@ from sst_graph.cli.messages import mention
 from sst_graph.cli.output_places import RERUN_FILE, check_apart
 from sst_graph.cli.progress import ProgressBar, counted
 from sst_graph.cli.reading import open_drive_of
-from sst_graph.errors import ConfigError, count_of
+from sst_graph.errors import ConfigError, count_of, in_file
 from sst_graph.files import output_file
-from sst_graph.inspect.inspection import inspect_result
+from sst_graph.inspect.frame_information import FrameInformation, frames_of
 from sst_graph.odometry.sweep import with_sweep_of
 from sst_graph.result import CalibrationResult, result_file
 from sst_graph.types import SemanticClass, Source
@@ -33,10 +34,12 @@ def run(args: argparse.Namespace) -> int:
         if args.save is not None:
             out = outputs.enter_context(output_file(args.save, args.overwrite, RERUN_FILE))
         result = given_result(args.result)
+        with in_file(result_file(args.result)):
+            information = frames_of(result)
         source = with_sweep_of(open_drive_of(args, args.data, result, args.result), result.diagnostics)
         place = None if out is None else out.partial
         with Recording(source.camera, live=out is None, save=place, tracked=False) as recording:
-            count = _log(recording, result, source)
+            count = _log(recording, result, source, information)
         if out is not None:
             out.publish()
             mention(
@@ -46,7 +49,9 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _log(recording: Recording, result: CalibrationResult, source: Source) -> int:
+def _log(
+    recording: Recording, result: CalibrationResult, source: Source, information: Sequence[FrameInformation]
+) -> int:
     """Log all frames, and the sigmas as frames accumulate; the number of frames shown."""
     time_offset_s, count = result.time_offset_of(source.name), 0
     frames = result.T_camera_lidar, time_offset_s, _classes(result)
@@ -58,7 +63,7 @@ def _log(recording: Recording, result: CalibrationResult, source: Source) -> int
     if not count:
         raise ConfigError(f"{source.name}: found no scan that can be shown, expected one or more")
     final = np.sqrt(np.diag(result.covariance))
-    for one in inspect_result(result).frames:
+    for one in information:
         if one.frame.drive == source.name:
             recording.sigmas_at(one.frame.frame, final * one.so_far)
     return count

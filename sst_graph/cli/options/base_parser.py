@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING, NoReturn, TypeAlias
+from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 
 from sst_graph.cli.messages import say
 from sst_graph.errors import ConfigError
@@ -20,6 +20,12 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         raise ConfigError(f"{message} (see '{self.prog} --help')")
+
+    def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
+        # Python before 3.13 makes an empty list of the value in --option=--, whatever the option expects.
+        if action.option_strings and arg_strings == ["--"]:
+            raise argparse.ArgumentError(action, "found --, expected a value")
+        return super()._get_values(action, arg_strings)
 
     def _print_message(self, message: str, file: SupportsWrite[str] | None = None) -> None:
         # Help and version are printed nowhere else; argparse's own passes over a stdout that fails.
