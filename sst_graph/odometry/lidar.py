@@ -66,6 +66,9 @@ _MISSED_COST = 1.0
 whitened residual."""
 _MIN_INLIER_RATIO = 0.3
 """A registration with fewer points paired than this fraction has failed."""
+_FASTEST_RADPS, _FASTEST_MPS = 10.0, 100.0
+"""No vehicle turns or drives faster. A scan that shows next to nothing (a single line) can be registered in
+any pose, and a prediction from that one misses all that follows, at ten seconds a scan."""
 _COMPENSATIONS = 3
 """Most registrations of one scan while its sweep compensation converges."""
 _CONVERGED_M = 5e-3
@@ -244,6 +247,8 @@ class LidarOdometry:
             return None
         found = orthonormal(found)
         twist = _log(np.linalg.inv(self._wTl) @ found) / seconds
+        if np.linalg.norm(twist[:3]) > _FASTEST_RADPS or np.linalg.norm(twist[3:]) > _FASTEST_MPS:
+            return None
         return _Registration(found, cloud, twist, registration_covariance(result))
 
     def _advance(self, last: Scan, scan: Scan, registration: _Registration | None) -> RelativeMotion:

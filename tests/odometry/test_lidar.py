@@ -269,6 +269,18 @@ def test_only_vehicles_are_better_than_nothing() -> None:
     assert motions[-1].aTb.translation()[0] == pytest.approx(0.2, abs=0.01)
 
 
+@pytest.mark.parametrize(("speed_mps", "yaw_rate_radps"), [(3.0, 0.0), (0.0, 0.3)])
+def test_what_no_vehicle_does_is_no_motion(speed_mps: float, yaw_rate_radps: float) -> None:
+    """The third scan comes fifty times too soon: it is bridged, and the odometry goes on."""
+    poses = path(speed_mps, yaw_rate_radps, 5)
+    stamps_ns = np.array([0.0, 1.0, 1.02, 2.02, 3.02]) * PERIOD_NS
+    motions = lidar_odometry(
+        scan_at(pose, int(stamp_ns), k)
+        for k, (pose, stamp_ns) in enumerate(zip(poses, stamps_ns, strict=True))
+    )
+    assert [motion.ok for motion in motions] == [True, False, True, True]
+
+
 @pytest.mark.parametrize("speed_mps", [0.0, 8.0, 28.0])
 def test_the_first_speed_is_found_from_nothing(speed_mps: float) -> None:
     scans = [scan_at(wTl, k * PERIOD_NS, k, share=0.9) for k, wTl in enumerate(path(speed_mps, 0.0, 2))]
