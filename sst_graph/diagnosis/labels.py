@@ -42,8 +42,8 @@ _LEAST_COPIED = 300
 """Fewest points inside of borders, and outside of them ..."""
 _MOST_DIFFER = 0.02
 """... and the share of these, labelled otherwise than their pixel, up to which labels are copies: copies have
-0.000. Of labels made apart the side that differs more has 0.37 and 0.57 on the KITTI drives, and 0.08 to 0.21
-if they are exact, on streets of two simulators at the true pose."""
+0.000. Of labels made apart the side that differs more has 0.37 and 0.57 on the KITTI drives, and 0.06 to 0.27
+if they are exact, on streets of three simulators at the true pose."""
 _BEFORE_M = 0.5
 """Points nearer to the camera's plane than this are not looked at [m]."""
 
