@@ -239,6 +239,12 @@ class NamedStep:
     kinds: tuple[str, ...]
     sentence: str
 
+    @property
+    def like_lost_frame(self) -> bool:
+        """Whether a lost image or scan may look so: at a steady speed its time offset is a step forward or
+        backward."""
+        return "offset" in self.kinds or any(way in self.sentence for way in ("forward", "backward"))
+
 
 def name_step(difference: Difference, cTl: gtsam.Pose3) -> NamedStep:
     """The step between two parts, in words.

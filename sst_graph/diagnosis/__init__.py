@@ -11,7 +11,7 @@ from sst_graph.diagnosis.cameras import uncalibrated
 from sst_graph.diagnosis.causes import likely_causes, mirror, preflight
 from sst_graph.diagnosis.finding import INVERTED, Finding
 from sst_graph.diagnosis.fit import Fitter, LabelFit
-from sst_graph.diagnosis.labels import few_labelled
+from sst_graph.diagnosis.labels import copied, few_labelled
 from sst_graph.diagnosis.lasers import other_axes, unknown_lasers
 from sst_graph.diagnosis.poses import other_camera
 
@@ -20,6 +20,7 @@ __all__ = [
     "Finding",
     "Fitter",
     "LabelFit",
+    "copied",
     "few_labelled",
     "likely_causes",
     "mirror",

@@ -36,6 +36,7 @@ def preflight(drives: Sequence[Drive], guess: Guess, classes: Sequence[SemanticC
         found += [clocks.point_times(drive), units.rounding(drive)]
         if classes:
             found += [labels.ground_points(drive), labels.mask_rows(drive), units.clouds(drive)]
+            found.append(labels.copied(drive, guess, classes))
         else:
             found.append(cameras.black_pictures(drive))
     if classes:
@@ -104,7 +105,9 @@ def _nothing_in_common(given: LabelFit | None) -> Finding:
         "nothing" if given is None else f"a place where {100.0 * given.explained:.0f} % of the outlines meet"
     )
     return Finding(
-        "the clouds and the images hardly show the same scene (another drive, or numbers that are far off)",
-        f"the search found {found}, and no start, mirroring, focal length or shift in time does better",
-        "look at a cloud and at the picture of the same number",
+        "the clouds and the images hardly show the same scene (another drive, numbers that are far off, or "
+        "the intrinsics of other pictures, such as those before rectification)",
+        f"the search found {found}, and no start, mirroring, shift in time, half or twice the focal length "
+        "does better",
+        "look at a cloud and at the picture of the same number, and compare the intrinsics with the camera",
     )

@@ -16,13 +16,13 @@ from streets import TRACKED_STREET, picked_frames
 
 from sst_graph import CalibrationConfig, open_source
 from sst_graph.batch.calibrate import calibrate_prepared, prepare_drives
-from sst_graph.batch.contradictions import compare_drives, find_contradictions
+from sst_graph.batch.contradictions import advice, compare_drives, find_contradictions
 from sst_graph.batch.motion_factor import MAX_DISAGREEMENT_CHI2, fuse_motion, with_motion
 from sst_graph.batch.part_solver import Part, PartSolver, SolvedPart
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.config import with_overrides
 from sst_graph.covariance.considered import AssumptionConfig
-from sst_graph.covariance.contradiction import PartEstimate
+from sst_graph.covariance.contradiction import NamedStep, PartEstimate
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import Drive
 from sst_graph.graph.outer_loop import JointConfig, solve_joint
@@ -400,3 +400,19 @@ def test_labels_tell_a_camera_that_paused_from_a_clock_that_was_set(clock_set: b
         assert result.status == "ok" and "by the labels the time offset is the same" in sentence
         error_s = result.time_offset_s - STREET.time_offset_s
         assert abs(error_s) < 3.0 * np.sqrt(result.covariance[6, 6]) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("kinds", "sentence", "lost"),
+    [
+        (("translation",), "translation by 92.8 cm ± 3.4 cm forward", True),
+        (("translation",), "translation by 92.8 cm ± 3.4 cm up", False),
+        (("offset",), "time offset by -98 ms ± 6 ms", True),
+        (("rotation",), "rotation by 1.00° ± 0.10° about the camera's x axis (pitch)", False),
+    ],
+)
+def test_a_step_along_the_road_may_be_a_lost_frame(kinds: tuple[str, ...], sentence: str, lost: bool) -> None:
+    """At a steady speed a time offset and a step forward look alike."""
+    said = advice(NamedStep(kinds, sentence))
+    assert ("an image or a scan was lost" in said) == lost
+    assert said.count("lost") <= 1 and said.startswith("check whether ")

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from sst_graph.batch.lower_edges import LowerEdgeSupport
+from sst_graph.diagnosis import copied
+from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
 from sst_graph.stepwise import Stepwise
 from sst_graph.tracker.by_edges.kinds import by_edges, by_labels, of_kind
@@ -18,6 +20,7 @@ from sst_graph.tracker.start.first_estimate import FirstEstimate, StartGuess
 from sst_graph.tracker.start.solution import first_estimate_steps, prior_gaussian
 from sst_graph.tracker.uncertainty import Uncertainty
 from sst_graph.tracker.window.epochs import MatchedPair
+from sst_graph.tracker.window.gaussian import Point
 from sst_graph.tracker.window.matcher import WindowMatcher
 from sst_graph.tracker.window.smoother import WindowSmoother
 from sst_graph.tracker.window.window import Stretch, Window
@@ -93,11 +96,11 @@ def start_steps(stretch: Stretch, guess: StartGuess, config: TrackerConfig) -> S
     """
     classes, drive, why = config.calibration.classes, stretch.drive, ""
     if not by_edges(classes):
-        return FirstEstimate((yield from first_estimate_steps(drive, guess, config)))
+        return FirstEstimate((yield from _by_labels_steps(drive, guess, config)))
     if by_labels(classes) and all(drive.labelled_ns):
         labelled = of_kind(drive, edges=False)
         try:
-            return FirstEstimate((yield from first_estimate_steps(labelled, guess, config)))
+            return FirstEstimate((yield from _by_labels_steps(labelled, guess, config)))
         except EstimationError as error:
             why = f"by labels: {error}; by edges: "
     try:
@@ -105,6 +108,17 @@ def start_steps(stretch: Stretch, guess: StartGuess, config: TrackerConfig) -> S
         return (yield from first_edge_estimate_steps(unlabelled, guess, config))
     except EstimationError as error:
         raise EstimationError(f"{why}{error}") from error
+
+
+def _by_labels_steps(drive: Drive, guess: StartGuess, config: TrackerConfig) -> Stepwise[Point]:
+    """The solution by labels; labels that were copied with the guess have none but the guess.
+
+    Raises:
+        EstimationError: none, or such labels.
+    """
+    if (found := copied(drive, guess, config.calibration.classes)) is not None:
+        raise EstimationError(found.sentence)
+    return (yield from first_estimate_steps(drive, guess, config))
 
 
 class Search(SpreadWork[FirstEstimate]):
