@@ -234,16 +234,13 @@ class NamedStep:
     Attributes:
         kinds: which of "rotation", "translation", "offset" take part.
         sentence: how large they are, in words: "rotation by 1.10° ± 0.05° about ..., time offset by ...".
+        like_lost_frame: a lost image or scan may look so: at a steady speed its time offset is a step forward
+            or backward.
     """
 
     kinds: tuple[str, ...]
     sentence: str
-
-    @property
-    def like_lost_frame(self) -> bool:
-        """Whether a lost image or scan may look so: at a steady speed its time offset is a step forward or
-        backward."""
-        return "offset" in self.kinds or any(way in self.sentence for way in ("forward", "backward"))
+    like_lost_frame: bool
 
 
 def name_step(difference: Difference, cTl: gtsam.Pose3) -> NamedStep:
@@ -269,7 +266,13 @@ def name_step(difference: Difference, cTl: gtsam.Pose3) -> NamedStep:
 
     best = min(subsets, key=price)
     step, covariance = _restricted(difference.step, information, best)
-    return NamedStep(best, ", ".join(_words(kind, step[_KINDS[kind]], covariance, cTl) for kind in best))
+    c_step = cTl.rotation().matrix() @ step[_KINDS["translation"]]
+    along = abs(c_step[2]) > _ONE_AXIS * float(np.linalg.norm(c_step))
+    return NamedStep(
+        best,
+        ", ".join(_words(kind, step[_KINDS[kind]], covariance, cTl) for kind in best),
+        bool("offset" in best or along),
+    )
 
 
 def _columns(subset: Sequence[str]) -> list[int]:

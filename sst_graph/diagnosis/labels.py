@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import cv2
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +16,7 @@ from sst_graph.drive.preparation import Drive
 from sst_graph.errors import count_of
 from sst_graph.features.mask_shift import MaskShift, mask_shift
 from sst_graph.odometry.lidar import MOVABLE_CLASSES
+from sst_graph.points import transformed_points
 from sst_graph.sampling import step_for
 from sst_graph.types import FloatArray, Guess, SemanticClass
 
@@ -44,8 +44,6 @@ _MOST_DIFFER = 0.02
 """... and the share of these, labelled otherwise than their pixel, up to which labels are copies: copies have
 0.000. Of labels made apart the side that differs more has 0.37 and 0.57 on the KITTI drives, and 0.06 to 0.27
 if they are exact, on streets of three simulators at the true pose."""
-_BEFORE_M = 0.5
-"""Points nearer to the camera's plane than this are not looked at [m]."""
 
 
 def searched_classes(drives: Sequence[Drive], classes: Sequence[SemanticClass]) -> Finding | None:
@@ -157,7 +155,7 @@ def copied(drive: Drive, guess: Guess, classes: Sequence[SemanticClass]) -> Find
     counts = np.zeros((2, 2, 2), np.intp)
     for pair in pairs[:: step_for(len(pairs), _COPIED_PAIRS)]:
         scan, mask = drive.scans[pair.scan], drive.images[pair.image].mask
-        uvs = _in_image(drive, guess.cTl, scan.lPs)
+        uvs = drive.camera.project(transformed_points(guess.cTl, scan.lPs))
         for c in classes:
             for way, to_middle in enumerate((0.5, 0.0)):
                 counts[way] += _beside_borders(mask, uvs + to_middle, scan.classes, c)
@@ -170,15 +168,6 @@ def copied(drive: Drive, guess: Guess, classes: Sequence[SemanticClass]) -> Find
         "are labelled otherwise than their pixel",
         "label clouds and pictures apart, for such labels only repeat the start; or take --method edges",
     )
-
-
-def _in_image(drive: Drive, cTl: gtsam.Pose3, lPs: FloatArray) -> FloatArray:
-    """(n, 2) projections of points (n, 3); NaN of those that are not before the camera [px]."""
-    camera = drive.camera
-    cPs = lPs @ cTl.rotation().matrix().T + cTl.translation()
-    depths = np.where(cPs[:, 2] > _BEFORE_M, cPs[:, 2], np.nan)
-    uvs = cPs[:, :2] / depths[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-    return np.asarray(uvs, np.float64)
 
 
 def _beside_borders(

@@ -403,16 +403,16 @@ def test_labels_tell_a_camera_that_paused_from_a_clock_that_was_set(clock_set: b
 
 
 @pytest.mark.parametrize(
-    ("kinds", "sentence", "lost"),
+    ("kinds", "like_lost_frame", "said"),
     [
-        (("translation",), "translation by 92.8 cm ± 3.4 cm forward", True),
-        (("translation",), "translation by 92.8 cm ± 3.4 cm up", False),
-        (("offset",), "time offset by -98 ms ± 6 ms", True),
-        (("rotation",), "rotation by 1.00° ± 0.10° about the camera's x axis (pitch)", False),
+        (("translation",), True, "the mount was moved or an image or a scan was lost,"),
+        (("translation",), False, "the mount was moved,"),
+        (("offset",), True, "an image or a scan was lost or a clock was set,"),
+        (("rotation",), False, "the mount was moved or the masks slide,"),
     ],
 )
-def test_a_step_along_the_road_may_be_a_lost_frame(kinds: tuple[str, ...], sentence: str, lost: bool) -> None:
+def test_a_step_along_the_road_may_be_a_lost_frame(
+    kinds: tuple[str, ...], like_lost_frame: bool, said: str
+) -> None:
     """At a steady speed a time offset and a step forward look alike."""
-    said = advice(NamedStep(kinds, sentence))
-    assert ("an image or a scan was lost" in said) == lost
-    assert said.count("lost") <= 1 and said.startswith("check whether ")
+    assert advice(NamedStep(kinds, "", like_lost_frame)).startswith(f"check whether {said}")
