@@ -16,13 +16,7 @@ import numpy as np
 
 from sst_graph.batch.method_estimate import held_offsets
 from sst_graph.batch.part_solver import Part, PartSolver, SolvedPart
-from sst_graph.covariance.contradiction import (
-    Difference,
-    NamedStep,
-    PartEstimate,
-    combined,
-    name_step,
-)
+from sst_graph.covariance.contradiction import Difference, PartEstimate, combined, name_step
 from sst_graph.drive.stamp_intervals import Jump
 from sst_graph.graph.state import State
 
@@ -272,24 +266,21 @@ def _step_sentence(parts: PartSolver, step: Step) -> str:
     else:
         where = f"frames {at} to {drive.scans[end - 1].index} and the others"
         what = "they differ"
-    return f"{drive.name}: {where} contradict each other: {what} in {named.sentence}; {advice(named)}"
+    return (
+        f"{drive.name}: {where} contradict each other: {what} in {named.sentence}; {advice(named.suspects)}"
+    )
 
 
-def advice(step: NamedStep, by_labels: bool = True) -> str:
-    """What to check where parts of a drive differ by a step."""
+def advice(kinds: Sequence[str], by_labels: bool = True) -> str:
+    """What to check where parts of a drive differ in some of rotation, translation and time offset."""
     turned = ("the mount was moved", "the masks slide")
     causes = {
         "rotation": turned if by_labels else turned[:1],
         "translation": ("the mount was moved",),
-        "offset": (_LOST, "a clock was set"),
+        "offset": ("an image or a scan was lost", "a clock was set"),
     }
-    likely = [cause for kind in step.kinds for cause in causes[kind]] + [_LOST] * step.like_lost_frame
-    return (
-        f"check whether {' or '.join(dict.fromkeys(likely))}, and calibrate the frames before and after apart"
-    )
-
-
-_LOST = "an image or a scan was lost"
+    likely = " or ".join(dict.fromkeys(cause for kind in kinds for cause in causes[kind]))
+    return f"check whether {likely}, and calibrate the frames before and after apart"
 
 
 def _drive_sentence(parts: PartSolver, number: int, difference: Difference) -> str:

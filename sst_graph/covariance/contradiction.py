@@ -234,13 +234,13 @@ class NamedStep:
     Attributes:
         kinds: which of "rotation", "translation", "offset" take part.
         sentence: how large they are, in words: "rotation by 1.10° ± 0.05° about ..., time offset by ...".
-        like_lost_frame: a lost image or scan may look so: at a steady speed its time offset is a step forward
-            or backward.
+        suspects: these, and "offset" beside a translation forward or backward: at a steady speed both look
+            alike.
     """
 
     kinds: tuple[str, ...]
     sentence: str
-    like_lost_frame: bool
+    suspects: tuple[str, ...]
 
 
 def name_step(difference: Difference, cTl: gtsam.Pose3) -> NamedStep:
@@ -271,7 +271,7 @@ def name_step(difference: Difference, cTl: gtsam.Pose3) -> NamedStep:
     return NamedStep(
         best,
         ", ".join(_words(kind, step[_KINDS[kind]], covariance, cTl) for kind in best),
-        bool("offset" in best or along),
+        (*best, "offset") if along and "offset" not in best else best,
     )
 
 

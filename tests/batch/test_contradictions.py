@@ -16,13 +16,13 @@ from streets import TRACKED_STREET, picked_frames
 
 from sst_graph import CalibrationConfig, open_source
 from sst_graph.batch.calibrate import calibrate_prepared, prepare_drives
-from sst_graph.batch.contradictions import advice, compare_drives, find_contradictions
+from sst_graph.batch.contradictions import compare_drives, find_contradictions
 from sst_graph.batch.motion_factor import MAX_DISAGREEMENT_CHI2, fuse_motion, with_motion
 from sst_graph.batch.part_solver import Part, PartSolver, SolvedPart
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.config import with_overrides
 from sst_graph.covariance.considered import AssumptionConfig
-from sst_graph.covariance.contradiction import NamedStep, PartEstimate
+from sst_graph.covariance.contradiction import PartEstimate
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import Drive
 from sst_graph.graph.outer_loop import JointConfig, solve_joint
@@ -400,19 +400,3 @@ def test_labels_tell_a_camera_that_paused_from_a_clock_that_was_set(clock_set: b
         assert result.status == "ok" and "by the labels the time offset is the same" in sentence
         error_s = result.time_offset_s - STREET.time_offset_s
         assert abs(error_s) < 3.0 * np.sqrt(result.covariance[6, 6]) < 0.01
-
-
-@pytest.mark.parametrize(
-    ("kinds", "like_lost_frame", "said"),
-    [
-        (("translation",), True, "the mount was moved or an image or a scan was lost,"),
-        (("translation",), False, "the mount was moved,"),
-        (("offset",), True, "an image or a scan was lost or a clock was set,"),
-        (("rotation",), False, "the mount was moved or the masks slide,"),
-    ],
-)
-def test_a_step_along_the_road_may_be_a_lost_frame(
-    kinds: tuple[str, ...], like_lost_frame: bool, said: str
-) -> None:
-    """At a steady speed a time offset and a step forward look alike."""
-    assert advice(NamedStep(kinds, "", like_lost_frame)).startswith(f"check whether {said}")
