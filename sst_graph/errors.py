@@ -51,7 +51,8 @@ def in_file(file: str | Path) -> Iterator[None]:
     try:
         yield
     except DataError as error:
-        if error.place.startswith(printable(file, _MAX_PART)):
+        name = printable(file, _MAX_PART)
+        if error.place.startswith(name) and error.place[len(name) : len(name) + 1] in ("", ":", ",", " "):
             raise
         raise type(error)(f"{file}: {error.place}", error.found, error.expected) from error
 

@@ -34,6 +34,8 @@ _KINDS = {"rotation": slice(0, 3), "translation": slice(3, 6), "offset": slice(6
 _TURNS = ("pitch", "yaw", "roll")
 _WAYS = (("left", "right"), ("up", "down"), ("backward", "forward"))
 """What a turn about each of the camera's axes, and a shift against or along it, is called."""
+_FORWARD = 2
+"""The axis of a camera that looks along the road."""
 
 
 @dataclass(frozen=True)
@@ -266,8 +268,7 @@ def name_step(difference: Difference, cTl: gtsam.Pose3) -> NamedStep:
 
     best = min(subsets, key=price)
     step, covariance = _restricted(difference.step, information, best)
-    c_step = cTl.rotation().matrix() @ step[_KINDS["translation"]]
-    along = abs(c_step[2]) > _ONE_AXIS * float(np.linalg.norm(c_step))
+    along = _only_axis(cTl.rotation().matrix() @ step[_KINDS["translation"]]) == _FORWARD
     return NamedStep(
         best,
         ", ".join(_words(kind, step[_KINDS[kind]], covariance, cTl) for kind in best),
@@ -291,6 +292,12 @@ def _restricted(
     return found, covariance
 
 
+def _only_axis(c_step: FloatArray) -> int | None:
+    """The axis of the camera that a step (3,) is along, or about; None where it is along no single one."""
+    axis = int(np.abs(c_step).argmax())
+    return axis if abs(c_step[axis]) > _ONE_AXIS * float(np.linalg.norm(c_step)) else None
+
+
 def _words(kind: str, step: FloatArray, covariance: FloatArray, cTl: gtsam.Pose3) -> str:
     own = covariance[_KINDS[kind], _KINDS[kind]]
     if kind == "offset":
@@ -299,18 +306,17 @@ def _words(kind: str, step: FloatArray, covariance: FloatArray, cTl: gtsam.Pose3
     c_step, size = R @ step, float(np.linalg.norm(step))
     unit = c_step / max(size, 1e-12)
     sigma = float(np.sqrt(unit @ R @ own @ R.T @ unit))
-    axis = int(np.abs(unit).argmax())
-    alone = abs(unit[axis]) > _ONE_AXIS
+    axis = _only_axis(c_step)
     if kind == "rotation":
         amount = f"rotation by {np.degrees(size):.2f}° ± {np.degrees(sigma):.2f}°"
-        if alone:
+        if axis is not None:
             return f"{amount} about the camera's {'xyz'[axis]} axis ({_TURNS[axis]})"
         each = ", ".join(
             f"{name} {value:+.2f}°" for name, value in zip(_TURNS, np.degrees(c_step), strict=True)
         )
         return f"{amount} ({each})"
     amount = f"translation by {100.0 * size:.1f} cm ± {100.0 * sigma:.1f} cm"
-    if alone:
+    if axis is not None:
         return f"{amount} {_WAYS[axis][int(c_step[axis] > 0.0)]}"
     each = ", ".join(f"{name} {100.0 * value:+.1f} cm" for name, value in zip("xyz", c_step, strict=True))
     return f"{amount} ({each} along the camera's axes)"

@@ -82,6 +82,7 @@ def run_drive(job: Job) -> Record:
     A result that stands there whole, as of a task that a scheduler repeats, is taken as it is, unless the
     drive's files have changed.
     """
+    _remove_outdated(job)
     record = finished_record(job)
     attempts = kills = 0
     while record is None or _is_to_be_repeated(record.status, attempts - kills - 1 < job.retries, kills):
@@ -94,6 +95,14 @@ def run_drive(job: Job) -> Record:
     if attempts and not has_ended():
         _write_record(job, record)
     return record
+
+
+def _remove_outdated(job: Job) -> None:
+    """Remove the result of a drive whose files have changed: where the new attempt fails, nothing is left of
+    the old one."""
+    with contextlib.suppress(SstGraphError, OSError):
+        if has_changed(job, Record.from_json(job.record.read(), job.record.url)):
+            job.result.remove()
 
 
 def _write_record(job: Job, record: Record) -> None:
@@ -110,7 +119,8 @@ def _is_to_be_repeated(status: Status, has_retries: bool, kills: int) -> bool:
 
 
 def finished_record(job: Job, stored: bytes | None = None) -> Record | None:
-    """The record of a drive whose result stands there whole and is of its files as they are, or None.
+    """The record of a drive whose result stands there whole, or None; whether the drive has changed since is
+    another question.
 
     A record is written after the result. Where it is missing (the batch was killed between the two), it is
     made from the result, and written.
@@ -126,7 +136,7 @@ def finished_record(job: Job, stored: bytes | None = None) -> Record | None:
                 and Place(record.place).whole(job.folder) == job.place
                 and _is_whole(job, stored is not None)
             ):
-                return None if has_changed(job, record) else record
+                return record
         if not (job.result / MANIFEST).exists():
             return None
         if job.result.is_local:

@@ -319,11 +319,10 @@ def _finished(jobs: Sequence[Job], out: Place) -> tuple[dict[str, Record], int]:
     found, changed = {}, 0
     for job in begun:
         data = stored.get(job.record)
-        before = _before(job, data)
-        if (record := finished_record(job, data)) is not None:
+        if (before := _before(job, data)) is not None and has_changed(job, before):
+            changed += 1
+        elif (record := finished_record(job, data)) is not None:
             found[job.drive.name] = record
-        else:
-            changed += before is not None and has_changed(job, before)
     return found, changed
 
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import os
+import stat
 from collections.abc import Iterator
 from hashlib import sha256
 from pathlib import Path
 
-_WORDS = (".txt", ".yaml", ".yml", ".json", ".csv", ".xml")
-_MOST_WORDS_BYTES = 2**20
-"""Smaller text files, such as calibrations and stamps, count with their contents: a number that is mended
-leaves the size as it was."""
+_TEXT_SUFFIXES = (".txt", ".yaml", ".yml", ".json", ".csv", ".xml")
+_MOST_TEXT_BYTES = 2**20
+"""Smaller text files, such as calibrations and stamps, count with their contents: a corrected number need not
+change their size."""
 
 
 def size_of(path: Path) -> int:
@@ -29,19 +30,37 @@ def fingerprint(path: Path) -> str:
             continue
         found = True
         digest.update(f"{name}\0{size}\0".encode("utf-8", "surrogateescape"))
-        if file.lower().endswith(_WORDS) and size < _MOST_WORDS_BYTES:
+        if file.lower().endswith(_TEXT_SUFFIXES) and size < _MOST_TEXT_BYTES:
             with contextlib.suppress(OSError):
                 digest.update(Path(file).read_bytes())
     return digest.hexdigest() if found else ""
 
 
 def _files(path: Path) -> Iterator[tuple[str, int]]:
-    """Names and sizes of the file, or of all in the folder, that can be looked at."""
-    if path.is_file():
-        yield os.fspath(path), path.stat().st_size
+    """Names and sizes of the file, or of all in the folder, that can be looked at; links are followed, each
+    folder once."""
+    if (size := _size(path)) is not None:
+        yield os.fspath(path), size
         return
-    for folder, _, names in os.walk(path):
+    seen: set[tuple[int, int]] = set()
+    for folder, folders, names in os.walk(path, followlinks=True):
+        with contextlib.suppress(OSError):
+            status = os.stat(folder)
+            if (status.st_dev, status.st_ino) in seen:
+                folders.clear()
+                continue
+            seen.add((status.st_dev, status.st_ino))
+        folders.sort()
         for name in names:
-            with contextlib.suppress(OSError):
-                file = os.path.join(folder, name)
-                yield file, os.stat(file).st_size
+            file = os.path.join(folder, name)
+            if (size := _size(file)) is not None:
+                yield file, size
+
+
+def _size(file: str | Path) -> int | None:
+    """Bytes of a file; None of what is no file (a folder, a pipe), or cannot be looked at."""
+    try:
+        status = os.stat(file)
+    except OSError:
+        return None
+    return status.st_size if stat.S_ISREG(status.st_mode) else None

@@ -69,6 +69,8 @@ _MIN_INLIER_RATIO = 0.3
 _FASTEST_RADPS, _FASTEST_MPS = 10.0, 100.0
 """No vehicle turns or drives faster. A scan that shows next to nothing (a single line) can be registered in
 any pose, and a prediction from that one misses all that follows, at ten seconds a scan."""
+_STAMPS_JITTER_S = 0.1
+"""Scans stamped on arrival may be so much farther apart than their stamps say."""
 _COMPENSATIONS = 3
 """Most registrations of one scan while its sweep compensation converges."""
 _CONVERGED_M = 5e-3
@@ -247,7 +249,10 @@ class LidarOdometry:
             return None
         found = orthonormal(found)
         twist = _log(np.linalg.inv(self._wTl) @ found) / seconds
-        if np.linalg.norm(twist[:3]) > _FASTEST_RADPS or np.linalg.norm(twist[3:]) > _FASTEST_MPS:
+        turned, moved = (
+            float(np.linalg.norm(part)) * min(1.0, seconds / _STAMPS_JITTER_S) for part in np.split(twist, 2)
+        )
+        if turned > _FASTEST_RADPS or moved > _FASTEST_MPS:
             return None
         return _Registration(found, cloud, twist, registration_covariance(result))
 

@@ -172,10 +172,11 @@ class CalibrationNode:
         def take() -> None:
             stamp_ns = self._stamp_ns(message, self.lidar)
             self._queue.add(stamp_ns, True, message)
-            # Where the first clouds are of the stamps' clock, the later ones are.
-            if self._reading.stored_times and (self.tracker is None or self._point_clock.words):
+            if self._reading.stored_times and self._point_clock.undecided:
+                times = None
                 with suppress(DataError):  # What is wrong with a cloud is said when it is used.
-                    self._point_clock.add(stamp_ns, times_of(message, self.lidar.topic), now_ns)
+                    times = times_of(message, self.lidar.topic)
+                self._point_clock.add(stamp_ns, times, now_ns)
 
         return self._received(self.lidar, now_ns, take)
 
@@ -280,8 +281,11 @@ class CalibrationNode:
         if self._info is None or first is None:
             self._waiting_for = "no image with a mask yet" if self._halves else "no image yet"
             return False
-        if self._point_clock.unsettled:
-            self._waiting_for = self._point_clock.unsettled
+        if self._reading.stored_times and not self._point_clock.scans:
+            self._waiting_for = "no cloud yet"
+            return False
+        if self._point_clock.waiting:
+            self._waiting_for = self._point_clock.waiting
             return False
         try:
             if self._geometry is None:

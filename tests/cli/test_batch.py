@@ -296,7 +296,7 @@ def test_from_s3_to_s3(drives: Path, tmp_path: Path, s3: str, monkeypatch: pytes
 def test_a_drive_whose_files_have_changed_is_run_again(
     drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Of a result that was made of other files nothing says so; data that are gone change nothing."""
+    """Where that fails, nothing is left of the old result. Data that are gone change nothing."""
     out, one = tmp_path / "out", drives / "v1_2026-03-01"
     command = ["batch", str(drives / "v1_*"), "--out", str(out), "--workers", "1", *FAST]
     assert main(command) == 3
@@ -311,6 +311,15 @@ def test_a_drive_whose_files_have_changed_is_run_again(
     after = results(out / "drives")
     changed = {Path(name).parts[0] for name in before if before[name] != after[name]}
     assert changed == {one.name}
+    whole = calib.read_text()
+    calib.write_text("P0: 1")
+    for _ in range(2):
+        assert main(command) == 3
+        assert rows_of(out)[one.name]["status"] == "bad_input" and not (out / "drives" / one.name).exists()
+    calib.write_text(whole)
+    assert main(command) == 3
+    assert results(out / "drives") == after
+    capfd.readouterr()
     shutil.rmtree(one)
     assert main(["batch", str(drives / "v1_*"), "--out", str(out), "--workers", "1", *FAST]) == 3
     assert "files have changed" not in capfd.readouterr().err

@@ -47,6 +47,19 @@ def test_what_is_no_change(tmp_path: Path) -> None:
     assert size_of(folder) == 160 + 8 + 1
 
 
+def test_links_are_followed_and_pipes_are_none(tmp_path: Path) -> None:
+    """As where clouds stand on another disk; a loop of links ends."""
+    folder, elsewhere = tmp_path / "a", drive(tmp_path / "b")
+    folder.mkdir()
+    (folder / "velodyne").symlink_to(elsewhere, target_is_directory=True)
+    (elsewhere / "loop").symlink_to(elsewhere, target_is_directory=True)
+    os.mkfifo(folder / "pipe.txt")
+    before = fingerprint(folder)
+    assert before != "" and size_of(folder) == 168
+    (elsewhere / "calib.txt").write_text("Tr: 1.35")
+    assert fingerprint(folder) != before
+
+
 def test_one_file_and_none(tmp_path: Path) -> None:
     bag = tmp_path / "drive.mcap"
     assert fingerprint(bag) == "" and size_of(bag) == 0

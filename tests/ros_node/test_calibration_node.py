@@ -193,15 +193,18 @@ def test_images_stamped_with_the_camera_s_link(bag: Any, config: TrackerConfig) 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("driver", [Driver(True), Driver(True, later_s=2 * HALF_S, arrives_s=0.004)])
+@pytest.mark.parametrize(
+    ("driver", "init"),
+    [(Driver(True), "tf"), (Driver(True, later_s=2 * HALF_S, arrives_s=0.004), "tf"), (Driver(True), "none")],
+)
 def test_times_of_points_by_the_lidar_s_own_clock(
-    tmp_path: Path, config: TrackerConfig, driver: Driver
+    tmp_path: Path, config: TrackerConfig, driver: Driver, init: str
 ) -> None:
     """The difference is found from the first ten clouds, which wait; then all is as with times after the
     stamp."""
     source = open_source(written(STREET))
     assert isinstance(source, KittiSource)
-    settings, lines = dataclasses.replace(SETTINGS, sweep="auto"), []
+    settings, lines = dataclasses.replace(SETTINGS, sweep="auto", init=init), []
     for own in (Driver(False), driver):
         node = CalibrationNode(settings, config)
         messages = _messages(bag_of_driver(source, tmp_path / str(own.own_clock), own))

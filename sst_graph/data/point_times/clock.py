@@ -32,11 +32,11 @@ from sst_graph.spread import robust_spread
 from sst_graph.sweep_timing import SweepStamp
 from sst_graph.types import FloatArray
 
-_LOOKED_AT, _FEWEST = 3, 3
-"""Scans that show whether times are of another clock; fewest of those that tell the difference."""
-COMPARED = 48
-"""Most scans that tell the difference."""
-_MOST_JITTER_S = 0.005
+_LOOKED_AT = 3
+"""Scans that show whether times are of another clock."""
+FEWEST, COMPARED = 3, 48
+"""Fewest and most scans that tell the difference."""
+MOST_JITTER_S = 0.005
 """Standard deviation of the difference, from scan to scan, above which it tells no time offset."""
 _MOST_DRIFT = 1e-3
 """Clocks of quartz drift by 1e-4 at most."""
@@ -89,14 +89,14 @@ class PointClock:
         since_ns: a stamp.
         reads_ns: what the clock reads at that stamp [ns].
         drift: seconds that it gains a second.
-        named: the instant of a sweep that a scan's stamp counts as.
+        sweep_stamp: the instant of a sweep that a scan's stamp counts as.
     """
 
     unit_ns: int
     since_ns: int
     reads_ns: int
     drift: float = 0.0
-    named: SweepStamp = "start"
+    sweep_stamp: SweepStamp = "start"
 
     def at(self, stamp_ns: int) -> int:
         """What it reads at a stamp [ns]."""
@@ -153,7 +153,7 @@ def clock_of_points(
     units = Counter(unit for times in scans if (unit := times.unit_ns()))
     unit_ns = max(units, key=lambda unit: units[unit], default=0)
     scans = [times for times in scans if times.unit_ns() == unit_ns]
-    if not unit_ns or len(scans) < _FEWEST:
+    if not unit_ns or len(scans) < FEWEST:
         return None, f"{OTHER_CLOCK}; {count_of(len(scans), 'scan')} cannot tell the difference"
     return _clock(scans, unit_ns, options.sweep_stamp)
 
@@ -174,7 +174,7 @@ def _clock(scans: Sequence[ScanTimes], unit_ns: int, stamp: SweepStamp) -> tuple
     drift, jitter_s = min((_drift(passed, ahead) for ahead in (firsts, lasts)), key=lambda found: found[1])
     if abs(drift) > _MOST_DRIFT:
         return None, f"{OTHER_CLOCK}, which runs {1.0 + drift:.4g} times as fast"
-    if jitter_s > _MOST_JITTER_S:
+    if jitter_s > MOST_JITTER_S:
         return None, f"{OTHER_CLOCK}, whose difference varies by {1e3 * jitter_s:.1f} ms from scan to scan"
     named = stamp if stamp != "forward" else _named_instant(scans, float(np.median(lasts - firsts)))
     level = float(np.quantile(firsts - drift * passed, _NEAR_THE_END))

@@ -248,9 +248,9 @@ def test_the_clock_of_a_stream() -> None:
         values = 40.0 + (1.0 + drift) * passed + SWEEP
         stream.add(stamp_ns, values, stamp_ns + 110_000_000)
         if k < 9:
-            assert stream.unsettled == f"{OTHER_CLOCK}: {k + 1} of 10 scans have told the difference yet"
+            assert stream.waiting == f"{OTHER_CLOCK}: {k + 1} of 10 scans have told the difference yet"
             continue
-        assert stream.unsettled == "" and "as the start of its sweep" in stream.words
+        assert stream.waiting == "" and "as the start of its sweep" in stream.words
         seconds = seconds_after_stamp(values, stamp_ns, stream.clock)
         assert seconds is not None
         np.testing.assert_allclose(seconds, SWEEP, atol=1e-4)
@@ -274,8 +274,37 @@ def test_what_stamps_name_is_found_once_in_a_stream() -> None:
             np.testing.assert_allclose(seconds, SWEEP - 0.1, atol=1e-5)
 
 
+def _added(stream: StreamClock, passed_s: float, own_s: float) -> float:
+    """Error of the first point's time, after a scan was added whose points begin at ``own_s`` [s]; NaN where
+    there is no clock."""
+    stamp_ns, values = EPOCH_NS + round(passed_s * 1e9), 40.0 + own_s + SWEEP
+    stream.add(stamp_ns, values, stamp_ns + 110_000_000)
+    seconds = None if stream.clock is None else seconds_after_stamp(values, stamp_ns, stream.clock)
+    return np.nan if seconds is None else float(seconds[0])
+
+
+@pytest.mark.parametrize("order", [[0, 0], [1, 0]], ids=["twice", "swapped"])
+def test_scans_that_come_twice_or_swapped_do_not_hinder_a_stream(order: list[int]) -> None:
+    stream = StreamClock()
+    for k in range(0, 60, 2):
+        for step in order:
+            error_s = _added(stream, 0.1 * (k + step), 0.1 * (k + step))
+    assert abs(error_s) < 1e-4 and not stream.waiting
+
+
+@pytest.mark.parametrize("step_s", [-0.3, 0.3])
+def test_a_clock_that_is_set_is_found_in_a_stream(step_s: float) -> None:
+    """Few scans have wrong times, then none have times, and from the tenth on they are right."""
+    stream = StreamClock()
+    before = [_added(stream, 0.1 * k, 0.1 * k) for k in range(60)]
+    assert np.isnan(before[:9]).all() and np.abs(before[9:]).max() < 1e-4
+    errors = [_added(stream, 6.0 + 0.1 * k + step_s, 6.0 + 0.1 * k) for k in range(40)]
+    assert np.count_nonzero(np.abs(errors) > 1e-3) <= 6
+    assert np.abs(errors[20:]).max() < 1e-4
+
+
 def test_a_stream_by_the_clock_of_its_stamps() -> None:
     stream = StreamClock()
     for values in (None, np.zeros(9), SWEEP, EPOCH_NS * 1e-9 + SWEEP):
         stream.add(EPOCH_NS, values, EPOCH_NS)
-        assert (stream.clock, stream.words, stream.unsettled) == (None, "", "")
+        assert (stream.clock, stream.words, stream.waiting) == (None, "", "")
