@@ -266,9 +266,8 @@ def _step_sentence(parts: PartSolver, step: Step) -> str:
     else:
         where = f"frames {at} to {drive.scans[end - 1].index} and the others"
         what = "they differ"
-    return (
-        f"{drive.name}: {where} contradict each other: {what} in {named.sentence}; {advice(named.suspects)}"
-    )
+    found = f"{where} contradict each other: {what} in {named.sentence}"
+    return f"{drive.name}: {found}; {advice(named.possible_kinds)}"
 
 
 def advice(kinds: Sequence[str], by_labels: bool = True) -> str:

@@ -236,13 +236,13 @@ class NamedStep:
     Attributes:
         kinds: which of "rotation", "translation", "offset" take part.
         sentence: how large they are, in words: "rotation by 1.10° ± 0.05° about ..., time offset by ...".
-        suspects: these, and "offset" beside a translation forward or backward: at a steady speed both look
-            alike.
+        possible_kinds: these, and "offset" beside a translation forward or backward: at a steady speed both
+            look alike.
     """
 
     kinds: tuple[str, ...]
     sentence: str
-    suspects: tuple[str, ...]
+    possible_kinds: tuple[str, ...]
 
 
 def name_step(difference: Difference, cTl: gtsam.Pose3) -> NamedStep:

@@ -157,8 +157,7 @@ def copied(drive: Drive, guess: Guess, classes: Sequence[SemanticClass]) -> Find
         scan, mask = drive.scans[pair.scan], drive.images[pair.image].mask
         uvs = drive.camera.project(transformed_points(guess.cTl, scan.lPs))
         for c in classes:
-            for way, to_middle in enumerate((0.5, 0.0)):
-                counts[way] += _beside_borders(mask, uvs + to_middle, scan.classes, c)
+            counts += _beside_borders(mask, uvs, scan.classes, c)
     shares = (counts[..., 1] / np.maximum(counts[..., 0], 1)).max(axis=1)
     if counts[..., 0].min() < _LEAST_COPIED or shares.min() > _MOST_DIFFER:
         return None
@@ -173,23 +172,25 @@ def copied(drive: Drive, guess: Guess, classes: Sequence[SemanticClass]) -> Find
 def _beside_borders(
     mask: NDArray[np.uint8], uvs: FloatArray, classes: NDArray[np.uint8], c: SemanticClass
 ) -> NDArray[np.intp]:
-    """(2, 2) points whose pixel is outside of a class, or inside, near its border; all, and those labelled
-    otherwise.
+    """(2, 2, 2) for either rounding, points whose pixel is outside of a class, or inside, near its border;
+    all, and those labelled otherwise.
 
     Args:
         mask: (h, w) of the image.
-        uvs: (n, 2) places, to be rounded down; NaN: none [px].
+        uvs: (n, 2) projections; NaN: none [px].
         classes: (n,) of the points.
     """
     within, square = (mask == c).astype(np.uint8), np.ones((2 * _COPIED_PX + 1,) * 2, np.uint8)
     near = (cv2.dilate(within, square) != cv2.erode(within, square)) & (mask != SemanticClass.IGNORE)
-    with np.errstate(invalid="ignore"):
-        seen = np.flatnonzero(((uvs >= 0.0) & (uvs < mask.shape[::-1])).all(axis=1))
-    u, v = uvs[seen].astype(np.intp).T
-    inside, own = within[v, u][near[v, u]] > 0, classes[seen][near[v, u]] == c
-    return np.array(
-        [[np.count_nonzero(side), np.count_nonzero(side & (own != inside))] for side in (~inside, inside)]
-    )
+    counts = []
+    for to_middle in (0.5, 0.0):
+        with np.errstate(invalid="ignore"):
+            seen = ((uvs + to_middle >= 0.0) & (uvs + to_middle < mask.shape[::-1])).all(axis=1)
+        u, v = (uvs[seen] + to_middle).astype(np.intp).T
+        inside, own = within[v, u][near[v, u]] > 0, classes[seen][near[v, u]] == c
+        sides = ~inside, inside
+        counts.append([[np.count_nonzero(side), np.count_nonzero(side & (own != inside))] for side in sides])
+    return np.array(counts)
 
 
 def shift(drives: Iterable[Drive]) -> MaskShift | None:

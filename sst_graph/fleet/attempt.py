@@ -79,10 +79,8 @@ class Job:
 def run_drive(job: Job) -> Record:
     """Calibrate one drive, again after a crash or a kill, and write its record. Never raises for the drive.
 
-    A result that stands there whole, as of a task that a scheduler repeats, is taken as it is, unless the
-    drive's files have changed.
+    A result that stands there whole, as of a task that a scheduler repeats, is taken as it is.
     """
-    _remove_outdated(job)
     record = finished_record(job)
     attempts = kills = 0
     while record is None or _is_to_be_repeated(record.status, attempts - kills - 1 < job.retries, kills):
@@ -95,14 +93,6 @@ def run_drive(job: Job) -> Record:
     if attempts and not has_ended():
         _write_record(job, record)
     return record
-
-
-def _remove_outdated(job: Job) -> None:
-    """Remove the result of a drive whose files have changed: where the new attempt fails, nothing is left of
-    the old one."""
-    with contextlib.suppress(SstGraphError, OSError):
-        if has_changed(job, Record.from_json(job.record.read(), job.record.url)):
-            job.result.remove()
 
 
 def _write_record(job: Job, record: Record) -> None:

@@ -241,10 +241,12 @@ def run_batch(
     checked_type("run", run, Callable, "a function of a Job")  # type: ignore[arg-type]
     jobs = [Job(drive, config.options, out, os.getcwd(), config.limits, config.retries) for drive in drives]
     records, changed = _finished(jobs, out)
+    for job in changed:  # Where the new attempt fails, nothing is left of the old result.
+        job.result.remove()
     left = [job for job in jobs if job.drive.name not in records]
     earlier, started = len(records), time.monotonic()
     failed = 0
-    progress(Progress(earlier, len(jobs), earlier, failed, 0.0, changed=changed))
+    progress(Progress(earlier, len(jobs), earlier, failed, 0.0, changed=len(changed)))
     if config.dask and left:
         coming = run_on_dask(left, config.dask, config.workers, run)
     else:
@@ -308,19 +310,19 @@ def _others(drives: Sequence[ListedDrive], out: Place) -> int:
     return sum(place.name not in given for place in there)
 
 
-def _finished(jobs: Sequence[Job], out: Place) -> tuple[dict[str, Record], int]:
-    """The records of drives whose results stand there whole, and how many have changed since."""
+def _finished(jobs: Sequence[Job], out: Place) -> tuple[dict[str, Record], list[Job]]:
+    """The records of drives whose results stand there whole, and the jobs of drives that have changed."""
     folder = out / DRIVES
     if not folder.exists():
-        return {}, 0
+        return {}, []
     there = {place.name for place in folder.below()}
     begun = [job for job in jobs if job.drive.name in there]
     stored = read_many(out / RECORDS / f"{job.drive.name}.json" for job in begun)
-    found, changed = {}, 0
+    found, changed = {}, []
     for job in begun:
         data = stored.get(job.record)
         if (before := _before(job, data)) is not None and has_changed(job, before):
-            changed += 1
+            changed.append(job)
         elif (record := finished_record(job, data)) is not None:
             found[job.drive.name] = record
     return found, changed

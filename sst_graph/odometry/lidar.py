@@ -248,13 +248,11 @@ class LidarOdometry:
         if not np.isfinite(found).all() or result.num_inliers < _MIN_INLIER_RATIO * cloud.size():
             return None
         found = orthonormal(found)
-        twist = _log(np.linalg.inv(self._wTl) @ found) / seconds
-        turned, moved = (
-            float(np.linalg.norm(part)) * min(1.0, seconds / _STAMPS_JITTER_S) for part in np.split(twist, 2)
-        )
+        step = _log(np.linalg.inv(self._wTl) @ found)
+        turned, moved = np.linalg.norm(step.reshape(2, 3), axis=1) / max(seconds, _STAMPS_JITTER_S)
         if turned > _FASTEST_RADPS or moved > _FASTEST_MPS:
             return None
-        return _Registration(found, cloud, twist, registration_covariance(result))
+        return _Registration(found, cloud, step / seconds, registration_covariance(result))
 
     def _advance(self, last: Scan, scan: Scan, registration: _Registration | None) -> RelativeMotion:
         """Go on to the registered pose, or the predicted one; the motion since the last scan."""

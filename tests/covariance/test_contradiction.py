@@ -127,7 +127,7 @@ def test_a_step_is_named_along_the_axes_of_the_camera(column: int, size: float, 
     assert named.sentence == words
     assert len(named.kinds) == 1
     # At a steady speed a step forward may be one of the time offset: a lost image or scan.
-    assert named.suspects == (*named.kinds, *["offset"] * words.endswith("forward"))
+    assert named.possible_kinds == (*named.kinds, *["offset"] * words.endswith("forward"))
 
 
 def test_one_number_is_preferred_where_time_and_translation_look_alike() -> None:

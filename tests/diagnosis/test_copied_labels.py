@@ -5,18 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
+import copied_labels
 import gtsam
 import numpy as np
 import pytest
-from stored import simulated
+from copied_labels import labelled_by_mask
 
 from sst_graph import CalibrationConfig, calibrate
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.diagnosis.labels import copied
 from sst_graph.drive.preparation import Drive
-from sst_graph.simulator import SimulationConfig
-from sst_graph.types import Frame, Guess, SemanticClass
+from sst_graph.types import Guess, SemanticClass
 
 CLASSES = (SemanticClass.VEHICLE,)
 CAUSE = "the labels of the clouds and of the pictures are copies of each other"
@@ -26,36 +26,13 @@ AWAY = np.array([0.005, -0.004, 0.004, 0.03, -0.02, 0.02])
 @cache
 def street(frames: int = 8) -> KeptDrive:
     """Exact labels that were made apart: what agrees best without being copied."""
-    config = SimulationConfig(
-        seed=741,
-        frames=frames,
-        width=621,
-        height=188,
-        azimuth_step_deg=0.3,
-        azimuth_limit_deg=60.0,
-        vehicle_density=0.2,
-        motion="no_stop",
-        time_offset_s=0.0,
-        label_noise=0.0,
-    )
-    return KeptDrive.of(simulated(config), sweep="auto")
+    return copied_labels.street(frames, label_noise=0.0)
 
 
 def labelled_by_masks(drive: KeptDrive, cTl: gtsam.Pose3, round_down: bool) -> KeptDrive:
     """The drive with each point's class read from the mask at its pixel."""
-    camera = drive.camera
-
-    def labelled(frame: Frame) -> Frame:
-        assert frame.scan is not None and frame.image is not None
-        cPs = frame.scan.points @ cTl.rotation().matrix().T + cTl.translation()
-        uvs = cPs[:, :2] / cPs[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-        u, v = np.floor(uvs + (0.0 if round_down else 0.5)).astype(np.intp).T
-        seen = (cPs[:, 2] > 0.5) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-        classes = np.full(len(u), SemanticClass.IGNORE, np.uint8)
-        classes[seen] = frame.image.mask[v[seen], u[seen]]
-        return replace(frame, scan=replace(frame.scan, classes=classes, instances=None))
-
-    return replace(drive, frames=tuple(map(labelled, drive.frames)))
+    frames = (labelled_by_mask(frame, drive.camera, cTl, round_down) for frame in drive.frames)
+    return replace(drive, frames=tuple(frames))
 
 
 def prepared(drive: KeptDrive) -> Drive:

@@ -69,7 +69,7 @@ def halves_reasons(problem: JointProblem, state: State, covariance: FloatArray) 
             reasons.append(
                 f"{drive.name}: frames {drive.scans[0].index} to {drive.scans[halves[0][-1]].index} and "
                 f"those from {at} on contradict each other: the later ones differ in {named.sentence}; "
-                f"{advice(named.suspects, by_labels=False)}"
+                f"{advice(named.possible_kinds, by_labels=False)}"
             )
     return tuple(reasons)
 
