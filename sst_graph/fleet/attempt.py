@@ -15,7 +15,7 @@ from sst_graph.errors import DataError, SstGraphError, printable
 from sst_graph.files import MANIFEST
 from sst_graph.files.manifest import read_manifest
 from sst_graph.files.staging import SUFFIX, claim
-from sst_graph.fleet.drive_files import fingerprint, size_of
+from sst_graph.fleet.drive_files import changed_at, fingerprint, size_of
 from sst_graph.fleet.drives import ListedDrive
 from sst_graph.fleet.isolated import Ending, Limits, has_ended, run_isolated
 from sst_graph.fleet.places import Place
@@ -131,6 +131,8 @@ def finished_record(job: Job, stored: bytes | None = None) -> Record | None:
             return None
         if job.result.is_local:
             made = _of_result(job, job.result.path)
+            if made is not None:
+                made = replace(made, files=_unchanged_files(job))
         else:
             with scratch_folder() as scratch:
                 made = _of_result(job, job.result.fetch(scratch))
@@ -146,6 +148,13 @@ def has_changed(job: Job, record: Record) -> bool:
     they are gone, or were fetched."""
     now = fingerprint(Path(job.place)) if job.drive.place.is_local and record.files else ""
     return now not in ("", record.files)
+
+
+def _unchanged_files(job: Job) -> str:
+    """Fingerprint of the files that a local result without a record is of; empty where that is not known: the
+    drive is not on this machine, or a file has changed since the result was written."""
+    data, written = Path(job.place), (job.result.path / MANIFEST).stat().st_mtime
+    return fingerprint(data) if job.drive.place.is_local and changed_at(data) <= written else ""
 
 
 def _is_whole(job: Job, is_there: bool) -> bool:

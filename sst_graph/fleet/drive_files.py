@@ -36,6 +36,17 @@ def fingerprint(path: Path) -> str:
     return digest.hexdigest() if found else ""
 
 
+def changed_at(path: Path) -> float:
+    """When a drive's files, or folders that hold some, last changed: contents, names or rights, as the file
+    system says [s since 1970]; 0 where there are none."""
+    files = {file for file, _ in _files(path)}
+    moment = 0.0
+    for changed in files | {os.path.dirname(file) for file in files if path.is_dir()}:
+        with contextlib.suppress(OSError):
+            moment = max(moment, os.stat(changed).st_ctime)
+    return moment
+
+
 def _files(path: Path) -> Iterator[tuple[str, int]]:
     """Names and sizes of the file, or of all in the folder, that can be looked at; links are followed, each
     folder once."""

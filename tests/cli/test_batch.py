@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -302,6 +303,11 @@ def test_a_drive_whose_files_have_changed_is_run_again(
     assert main(command) == 3
     before = results(out / "drives")
     calib = next(one.rglob("calib.txt"))
+    stored = out / "records" / f"{one.name}.json"
+    record = Record.from_json(stored.read_bytes(), "record")
+    stored.unlink()  # as where the batch is killed before it is written
+    assert main(command) == 3
+    assert replace(Record.from_json(stored.read_bytes(), "record"), cost=record.cost) == record
     *others, last = calib.read_text().rstrip().split(" ")
     calib.write_text(" ".join([*others, f"{float(last) + 0.01:.6f}\n"]))
     capfd.readouterr()

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from sst_graph.fleet.drive_files import fingerprint, size_of
+from sst_graph.fleet.drive_files import changed_at, fingerprint, size_of
 
 
 def drive(folder: Path) -> Path:
@@ -34,6 +35,28 @@ def test_a_change_shows(tmp_path: Path, change: Callable[[Path], object]) -> Non
     assert before == fingerprint(drive(tmp_path / "b")) != ""
     change(folder)
     assert fingerprint(folder) != before
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda folder: (folder / "calib.txt").write_text("Tr: 1.35"),
+        lambda folder: (folder / "scans" / "1.bin").unlink(),
+        lambda folder: (folder / "scans" / "0.bin").rename(folder / "scans" / "2.bin"),
+    ],
+    ids=["a number", "one less", "a name"],
+)
+def test_when_it_changed(tmp_path: Path, change: Callable[[Path], object]) -> None:
+    folder = drive(tmp_path / "a")
+    (folder / "scans" / "1.bin").write_bytes(b"1")
+    before = changed_at(folder)
+    for file in folder.rglob("*"):
+        os.utime(file, (0, 0))  # of no use, for copies keep this time
+    assert changed_at(folder) >= before > 0.0
+    before = changed_at(folder)
+    time.sleep(0.05)  # the clock of a file system has a step
+    change(folder)
+    assert changed_at(folder) > before
 
 
 def test_what_is_no_change(tmp_path: Path) -> None:
@@ -62,9 +85,9 @@ def test_links_are_followed_and_pipes_are_none(tmp_path: Path) -> None:
 
 def test_one_file_and_none(tmp_path: Path) -> None:
     bag = tmp_path / "drive.mcap"
-    assert fingerprint(bag) == "" and size_of(bag) == 0
+    assert fingerprint(bag) == "" and size_of(bag) == 0 and changed_at(bag) == 0.0
     bag.write_bytes(b"123")
     before = fingerprint(bag)
-    assert before != "" and size_of(bag) == 3
+    assert before != "" and size_of(bag) == 3 and changed_at(bag) == bag.stat().st_ctime
     bag.write_bytes(b"1234")
     assert fingerprint(bag) != before
