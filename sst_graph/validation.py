@@ -1,7 +1,7 @@
-"""What a scan or an image must be, checked once where it enters an estimator.
+"""What a drive, a scan or an image must be, checked once where it comes in.
 
-Both functions return the same data in the documented dtypes (:mod:`sst_graph.types`), without a copy where
-nothing has to change. Whole numbers and floats of any width and byte order are converted where every value
+Scans and images come back in the documented dtypes (:mod:`sst_graph.types`), without a copy where nothing has
+to change. Whole numbers and floats of any width and byte order are converted where every value
 fits; everything else is refused with what was found and what was expected.
 """
 
@@ -14,12 +14,12 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.errors import DataError, count_of
+from sst_graph.errors import DataError, count_of, one_line
 from sst_graph.factors.arguments import described, is_whole, masked_values
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.files.checked_values import checked_pose, checked_time_offset_s, pinhole_camera
+from sst_graph.files.checked_values import checked_pose, checked_text, checked_time_offset_s, pinhole_camera
 from sst_graph.timestamps import LATEST_NS
-from sst_graph.types import NO_PICTURE, CameraImage, Frame, PixelStretch, Scan, SemanticClass
+from sst_graph.types import NO_PICTURE, CameraImage, Frame, PixelStretch, Scan, SemanticClass, Source
 
 MOST_POINTS = 10_000_000
 """Points of a scan; ten times what the densest spinning LiDAR gives in a sweep."""
@@ -34,6 +34,36 @@ MOST_STRETCH = 1e6
 _IS_CLASS = np.isin(np.arange(256), [int(c) for c in SemanticClass])
 _FIRST_UNKNOWN = int(np.argmin(_IS_CLASS))
 """All smaller numbers are classes."""
+
+
+def is_source(value: object) -> bool:
+    """Whether a value has what a :class:`~sst_graph.types.Source` has."""
+    return all(hasattr(value, name) for name in ("camera", "nominal", "name", "__len__", "__getitem__"))
+
+
+def checked_source(source: Any) -> Source:
+    """A source whose own words can be used: its name, with which results are written, length, camera and
+    nominal extrinsic. Its frames are checked where they are read.
+
+    Raises:
+        DataError: one of these is none.
+    """
+    if not is_source(source):
+        raise DataError("a drive", described(source), "a source, with name, camera, nominal and frames")
+    name = source.name
+    if not isinstance(name, str):
+        raise DataError(f"a {type(source).__name__}: name", described(name), "text")
+    checked_text(name, f"a {type(source).__name__}: name")
+    try:
+        count = len(source)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise DataError(f"{name}: length", one_line(error), "a number of frames") from error
+    if count == 0:
+        raise DataError(name, "no frame", "one or more")
+    checked_intrinsics(source.camera, f"{name}: camera")
+    if not isinstance(source.nominal, gtsam.Pose3 | None):
+        raise DataError(f"{name}: nominal", described(source.nominal), "a gtsam.Pose3, or None")
+    return source  # type: ignore[no-any-return]
 
 
 def checked_position(position: Any, count: int, slices: bool = False) -> int:

@@ -21,6 +21,7 @@ from sst_graph.files.typed_values import wrong_fields
 from sst_graph.result import CALIBRATION_NAME, RIG_NAME, read_result
 from sst_graph.sweep_timing import SweepStamp, SweepTiming
 from sst_graph.types import Source
+from sst_graph.validation import checked_source
 
 Sweep = Literal["auto", "compensated", "clockwise", "counterclockwise", "instant", "azimuth"]
 LabelEncoding = Literal["auto", "ids", "trainids", "coco", "coco-133", "ade20k", "ade20k-150", "mapillary"]
@@ -177,7 +178,7 @@ class Loader:
                 raise ConfigError(
                     f"--{name.replace('_', '-')} {value}: means nothing for {path} ({self.layout})"
                 )
-        source = self.open(path, options)
+        source = checked_source(self.open(path, options))
         if options.lidar_pose is None:
             return source
         return LidarFrameSource(source, parse_lidar_pose(options.lidar_pose))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,8 @@ import numpy as np
 import pytest
 from layouts import as_folder, as_kitti_raw
 
-from sst_graph.data import Loader, loader_names, open_source, register_loader
+from sst_graph.data import Loader, SourceOptions, loader_names, open_source, register_loader
+from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.input_statistics import image_statistics
 from sst_graph.drive.preparation import prepare_drive
 from sst_graph.errors import ConfigError, DataError
@@ -248,6 +250,22 @@ def test_names_of_loaders_are_unique() -> None:
     for name in ("kitti", "auto"):
         with pytest.raises(ConfigError, match="taken"):
             register_loader(name, loader)
+
+
+@pytest.mark.parametrize(
+    ("said", "message"),
+    [
+        ({"name": 5}, "a KeptDrive: name: found 5, expected text"),
+        ({"nominal": "Tr"}, "nominal: found the text 'Tr', expected a gtsam.Pose3"),
+        ({"camera": None}, "camera: "),
+        ({"frames": ()}, "found no frame"),
+    ],
+)
+def test_what_a_loader_brings_is_checked(drive: Path, said: dict[str, Any], message: str) -> None:
+    kept = KeptDrive.of(open_source(drive))
+    loader = Loader(lambda path: False, lambda path, options: replace(kept, **said), "none")
+    with pytest.raises(DataError, match=message):
+        loader.opened(drive, SourceOptions())
 
 
 @pytest.mark.parametrize(
