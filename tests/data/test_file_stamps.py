@@ -81,6 +81,24 @@ def test_a_count_behind_seconds_is_no_part_of_them(tmp_path: Path) -> None:
         tabled(tmp_path, [f"img{k}.png,{DATE + k},{k}" for k in range(3)])
 
 
+@pytest.mark.parametrize(
+    "heading",
+    ["name,sec,nanosec", "#file,secs,nsecs", "image,header.stamp.sec,header.stamp.nanosec", "f,t [s],t [ns]"],
+)
+def test_columns_that_the_heading_names(tmp_path: Path, heading: str) -> None:
+    """Of a simulation's clock, and without zeros before the nanoseconds."""
+    found = tabled(tmp_path, [heading, "img0.png,12,900000000", "img1.png,13,0", "img2.png,13,50000000"])
+    assert found == [12_900_000_000, 13_000_000_000, 13_050_000_000]
+
+
+@pytest.mark.parametrize(
+    ("heading", "nanoseconds"), [("name,width,height", "0"), ("name,sec,nsec", "1000000000")]
+)
+def test_columns_that_are_no_nanoseconds(tmp_path: Path, heading: str, nanoseconds: str) -> None:
+    with pytest.raises(DataError, match=rf"images\.csv:2: found 'img0\.png,12,{nanoseconds}', expected name"):
+        tabled(tmp_path, [heading, f"img0.png,12,{nanoseconds}", "img1.png,13,1", "img2.png,13,50"])
+
+
 @pytest.mark.parametrize("rest", ["1", "640,480"])
 def test_columns_behind_seconds_and_nanoseconds(tmp_path: Path, rest: str) -> None:
     found = tabled(tmp_path, [f"img{k}.png,{DATE},{k + 1}00000000,{rest}" for k in range(3)])

@@ -4,7 +4,8 @@
 commas, semicolons, tabs or blanks between; a first line of words is a heading, a line behind "#" a comment.
 Of more columns those of the name and of the stamp are taken, where they show; empty ones at the end are none.
 A file without a line is left out, and so is a line whose file is missing. Names may have a path before them,
-or lack their ending.
+or lack their ending. Where the heading names a column of seconds and one of nanoseconds ("sec", "nanosec"),
+these are the stamp, of any clock, with or without zeros before the nanoseconds.
 
 A stamp, here or as a name, is seconds with a decimal point ("1317048145.963.png"), whole nanoseconds
 ("1317048145963000000.png"), or seconds and nanoseconds ("1317048145_963000000.png", or two columns of which
@@ -42,6 +43,10 @@ _PAIR = re.compile(r"(?=[1-4]\d{9}_|\d+_\d{9}$)(\d{1,10})_(\d{1,9})", re.ASCII)
 _DATE = re.compile(r"\d{9,10}\.\d+|\d{13,19}", re.ASCII)
 """What cannot be a count beside a stamp: a date in seconds, or in whole units of 1 ms to 1 ns."""
 _SECONDS_OF_DATE = re.compile(r"[1-4]\d{9}", re.ASCII)
+_SECONDS_HEADING = re.compile(r"(^|[_. #\[])(s|secs?|seconds)\]?$", re.IGNORECASE)
+_NANOSECONDS_HEADING = re.compile(r"(^|[_. #\[])(ns|nsecs?|nanosecs?|nanoseconds)\]?$", re.IGNORECASE)
+_UP_TO_12_DIGITS = re.compile(r"\d{1,12}", re.ASCII)
+_UP_TO_9_DIGITS = re.compile(r"\d{1,9}", re.ASCII)
 _DATES_NS = (10**18, 42 * 10**17)
 """The years 2001 to 2103, between which dates of other units than nanoseconds have to lie [ns]."""
 _OTHER_UNITS_NS = (1_000, 1_000_000)
@@ -164,11 +169,14 @@ def _table(table: Path, files: Mapping[str, Path]) -> tuple[dict[str, int], int]
     places: dict[str, str] = {}
     missing: list[tuple[str, str]] = []
     known = _by_any_name(files)
-    for number, line in enumerate(text.splitlines(), 1):
+    lines = text.splitlines()
+    columns = _seconds_and_nanoseconds(_words(lines[0])) if lines else None
+    for number, line in enumerate(lines, 1):
         words = _words(line)
         place = f"{table}:{number}"
         if not words or _is_comment(words, known) or (number == 1 and _is_heading(words, known)):
             continue
+        words = _with_one_stamp(words, columns)
         entry = _entry(words, known) if len(words) == 2 else _entry_of_many(words, known)
         if entry is None:
             raise DataError(place, f"{line!r:.80}", _LINE)
@@ -229,6 +237,26 @@ def _entry_of_many(words: list[str], known: Mapping[str, str]) -> tuple[str, str
     if len(dates) == 1:
         return named[0], dates.pop()
     return (named[0], pairs[0]) if len(pairs) == 1 and not dates else None
+
+
+def _seconds_and_nanoseconds(heading: list[str]) -> tuple[int, int] | None:
+    """Columns of seconds and nanoseconds that a heading, or a comment in its place, names; None of others."""
+    found = [
+        [column for column, word in enumerate(heading) if kind.search(word)]
+        for kind in (_SECONDS_HEADING, _NANOSECONDS_HEADING)
+    ]
+    return (found[0][0], found[1][0]) if len(found[0]) == len(found[1]) == 1 else None
+
+
+def _with_one_stamp(words: list[str], columns: tuple[int, int] | None) -> list[str]:
+    """A line's fields with one stamp in the place of its two columns; as they are where it has others."""
+    if columns is None or max(columns) >= len(words):
+        return words
+    seconds, nanoseconds = (words[column] for column in columns)
+    if not _UP_TO_12_DIGITS.fullmatch(seconds) or not _UP_TO_9_DIGITS.fullmatch(nanoseconds):
+        return words
+    others = [word for column, word in enumerate(words) if column not in columns]
+    return [*others, f"{seconds}.{nanoseconds:0>9}"]
 
 
 def _is_heading(words: list[str], known: Mapping[str, str]) -> bool:
