@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from itertools import chain
 from pathlib import Path
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from sst_graph.config import to_dict
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
+from sst_graph.timestamps import LATEST_NS
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.types import CameraImage, Frame, Scan, Source
 from sst_graph.validation import checked_image, checked_scan
@@ -109,9 +111,9 @@ def check_inputs(tracker: Tracker) -> None:
         ValueError: it is not.
     """
     setup, inputs = tracker.setup, tracker.inputs
-    newest = inputs.scan_order.newest_ns
     whole = isinstance(setup, Setup) and isinstance(inputs.seen, SeenFrames) and inputs.seen.is_whole
-    whole = whole and (newest is None or isinstance(newest, int))
+    orders = (inputs.scan_order, inputs.image_order)
+    whole = whole and all(isinstance(order.newest_ns, int | None) for order in orders)
     if not whole or (setup.camera, setup.config.estimating) != (inputs.camera, inputs.config):
         raise ValueError("inputs of another tracker")
 
@@ -128,19 +130,17 @@ def check_setup(tracker: Tracker, setup: Setup, place: str | Path) -> None:
 
 
 def frames_to_come(tracker: Tracker, source: Source, place: str | Path) -> Iterator[Frame]:
-    """The frames of a drive behind the newest scan of a tracker that was resumed.
+    """The frames of a drive behind the newest scan and the newest image of a tracker that was resumed.
 
-    Those up to it are read past, and compared with what the tracker remembers: every scan and image that it
+    Those up to them are read past, and compared with what the tracker remembers: every scan and image that it
     used, of more than MOST the first and the latest.
 
     Raises:
         DataError: the tracker was saved on another drive, or on other frames of it.
     """
     comparison, frames, following = _DriveComparison(tracker), iter(source), list[Frame]()
-    newest_ns = tracker.inputs.scan_order.newest_ns
     for frame in frames:
-        stamp_ns = _newest(frame)
-        if newest_ns is None or (stamp_ns is not None and stamp_ns > newest_ns):
+        if not comparison.is_past(frame):
             following.append(frame)
             break
         comparison.compare(frame.scan, frame.image)
@@ -154,20 +154,29 @@ class _DriveComparison:
     """A drive's frames against those that a tracker has used."""
 
     def __init__(self, tracker: Tracker) -> None:
-        newest_ns = tracker.inputs.scan_order.newest_ns
-        self._camera, self._expected = tracker.setup.camera, tracker.inputs.seen.digests()
-        self._read_past = {key for key in self._expected if newest_ns is not None and key[1] <= newest_ns}
+        inputs = tracker.inputs
+        self._camera, self._expected = tracker.setup.camera, inputs.seen.digests()
+        orders = {"scan": inputs.scan_order, "image": inputs.image_order}
+        self._newest_ns = {
+            sensor: -LATEST_NS if order.newest_ns is None else order.newest_ns
+            for sensor, order in orders.items()
+        }
+        self._read_past = set(self._expected)
         self._others: list[str] = []
 
+    def is_past(self, frame: Frame) -> bool:
+        """Whether the tracker has used a later one, or its scan or image; each sensor has its own clock."""
+        given = [data for data in (frame.scan, frame.image) if data is not None]
+        return any(data.stamp_ns <= self._newest_ns[_sensor(data)] for data in given)
+
     def compare(self, scan: Scan | None, image: CameraImage | None) -> None:
-        """One frame."""
-        try:
-            if scan is not None:
+        """One frame; what cannot be used, the tracker has refused, too."""
+        if scan is not None:
+            with suppress(DataError):
                 self._compare(checked_scan(scan))
-            if image is not None:
+        if image is not None:
+            with suppress(DataError):
                 self._compare(checked_image(image, self._camera))
-        except DataError:
-            return  # the tracker refused it, too
 
     def _compare(self, data: Scan | CameraImage) -> None:
         key = _sensor(data), data.stamp_ns
@@ -179,12 +188,6 @@ class _DriveComparison:
         """Frames that differ or are missing, in words; empty where none does."""
         missing = [f"no {sensor} of {stamp_ns} ns" for sensor, stamp_ns in sorted(self._read_past)]
         return next(iter([*self._others, *missing]), "")
-
-
-def _newest(frame: Frame) -> int | None:
-    """Stamp of a frame's scan, or of its image where it has none."""
-    data = frame.scan if frame.scan is not None else frame.image
-    return None if data is None else data.stamp_ns
 
 
 def _sensor(data: Scan | CameraImage) -> str:
