@@ -6,7 +6,9 @@ summed with falling weights (Bartlett's kernel: Newey & West, Econometrica 1987)
 too small and uncertain: it is enlarged so that 1.96 of its sigmas hold 95 % of the errors (Kiefer &
 Vogelsang, Econometric Theory 2005, table 1).
 An error that all pairs share, such as that of the principal point, does not show in the residuals: it is
-given by :class:`MotionErrors`. Of the rotation, no more counts as known than both sensors saw.
+given by :class:`MotionErrors`. Another is what the interpolation between scans smooths away of fast motion,
+such as a pitching of 3 Hz that is seen at 10 Hz: images see all of it, and an earlier or later time makes up
+for it in all pairs alike. Of the rotation, no more counts as known than both sensors saw.
 """
 
 from __future__ import annotations
@@ -80,9 +82,10 @@ def hand_eye_covariance(
     # The rows of a direction that is not used are 0 in J.
     moved = np.swapaxes(J, 1, 2) @ terms.roots
     seconds = 1e-9 * np.array([camera.to_ns - camera.from_ns for camera in cameras])
-    shared = np.zeros((7, 6))
+    shared = np.zeros((7, 7))
     shared[:, :3] = np.radians(errors.turn_rate_deg_s) * np.tensordot(seconds, moved[:, :, :3], 1)
-    shared[:, 3:] = np.radians(errors.direction_deg) * moved[:, :, 3:].sum(axis=0)
+    shared[:, 3:6] = np.radians(errors.direction_deg) * moved[:, :, 3:].sum(axis=0)
+    shared[:, 6] = np.einsum("nij,nj->i", moved, terms.smoothed_away)
     excess = _excess(scores, model, _breaks(cameras))
     covariance = _sandwich(bread, excess) + bread @ shared @ shared.T @ bread
     # 3. The rotation is known no better than by what both sensors saw. The offset is: twists are measured by

@@ -154,6 +154,7 @@ class HandEyeTerms:
             and the LiDAR's noise is averaged more or less [1/s].
         rows_H_step: (n, 6, 6) the residual by a right perturbation of the LiDAR's motion, in units of the
             scaled noise.
+        smoothed_away: (n, 6) the residual by what the LiDAR's interpolated motions lack of fast motion.
     """
 
     pairs: MotionPairs
@@ -161,6 +162,7 @@ class HandEyeTerms:
     covariances: FloatArray
     noise_slopes: FloatArray
     rows_H_step: FloatArray
+    smoothed_away: FloatArray
 
     def __len__(self) -> int:
         return len(self.pairs)
@@ -285,7 +287,8 @@ def _terms(pairs: MotionPairs, state: State) -> HandEyeTerms:
     carried = transfer @ Ad
     own[~residuals.directed, 3:] = own[~residuals.directed, :, 3:] = carried[~residuals.directed, 3:] = 0.0
     own[~residuals.directed, 3:, 3:] = np.eye(3)
-    return HandEyeTerms(pairs, residuals, own, _noise_slopes(own, carried, lidars), carried)
+    lacking = (carried @ lidars.smoothed_away[..., None])[..., 0]
+    return HandEyeTerms(pairs, residuals, own, _noise_slopes(own, carried, lidars), carried, lacking)
 
 
 def _scaled(terms: HandEyeTerms, scales: NoiseScales, weights: FloatArray) -> HandEyeTerms:

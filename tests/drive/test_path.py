@@ -188,3 +188,27 @@ def test_at_stamps_nothing_is_between() -> None:
     still = SensorPath(motions(weaving, evenly(42))).steps(starts, starts + PERIOD_NS)
     rocks = SensorPath(motions(rocking, evenly(42))).steps(starts, starts + PERIOD_NS)
     np.testing.assert_allclose(rocks.covariances, still.covariances, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("hz", "least", "most"), [(2.5, 1.2, 2.0), (3.1, 1.0, 1.5), (3.5, 0.8, 1.2)])
+def test_what_is_smoothed_away_of_fast_motion(hz: float, least: float, most: float) -> None:
+    """It has the sense of the error, and covers it up to 3.1 Hz seen at 10 Hz; at stamps there is none."""
+
+    def fast(t: float) -> gtsam.Pose3:
+        wave = np.sin(2.0 * np.pi * hz * t)
+        return gtsam.Pose3(
+            gtsam.Rot3.RzRyRx(0.0, 0.002 * wave, 0.2 * t), np.array([8.0 * t, 0.0, 0.02 * wave])
+        )
+
+    path = SensorPath(motions(fast, evenly(60)))
+    starts = np.arange(8, 50) * PERIOD_NS + PERIOD_NS // 4
+    steps = path.steps(starts, starts + PERIOD_NS)
+    truth = [fast(a * 1e-9).between(fast(a * 1e-9 + 0.1)) for a in starts.tolist()]
+    lacking = np.array(
+        [gtsam.Pose3.Logmap(gtsam.Pose3(T).between(t)) for T, t in zip(steps.aTbs, truth, strict=True)]
+    )
+    for axis in (1, 5):
+        error, told = lacking[:, axis], steps.smoothed_away[:, axis]
+        assert least < (told @ error) / (error @ error) < most
+    at_stamps = path.steps(starts - PERIOD_NS // 4, starts + 3 * PERIOD_NS // 4)
+    np.testing.assert_allclose(at_stamps.smoothed_away, 0.0, atol=1e-12)

@@ -66,6 +66,20 @@ def test_covariance_fits_the_errors() -> None:
     assert max(nees) < 20.0
 
 
+def rocking(t: float) -> gtsam.Pose3:
+    """Pose at a time [s]: 5 m/s, pitching at 1.3 Hz and, less, at 3.1 Hz, which 10 Hz just shows."""
+    pitch = 0.003 * np.sin(2.0 * np.pi * 1.3 * t) + 0.0013 * np.sin(2.0 * np.pi * 3.1 * t + 1.0)
+    return gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, pitch, 0.05 * t), np.array([5.0 * t, 0.1 * t**2, 0.0]))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 5])
+def test_fast_motion_between_scans_is_in_the_covariance(seed: int) -> None:
+    """All images are as far from their scans: the offset makes up for what is smoothed away between them."""
+    solution = solve_motion([made_drive(rocking, 60, seed)], Guess(TRUE, OFFSET_S))[0]
+    error_s, sigma_s = error_of(solution)[6], np.sqrt(solution.covariance[6, 6])
+    assert 2e-3 < abs(error_s) < 2.0 * sigma_s < 10e-3
+
+
 @pytest.mark.slow
 def test_few_pairs_do_not_widen_the_covariance_without_need() -> None:
     """Twelve frames have eleven pairs, but 55 residuals: few clusters are not few residuals."""
