@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
 from sst_graph.assumptions import ASSUMPTIONS, Assumption, named_sigmas
-from sst_graph.batch.problem import CalibrationProblem, JointEstimate
+from sst_graph.batch.problem import CalibrationProblem, JointEstimate, robust_of
 from sst_graph.covariance.broken_assumptions import Evidence, considered_sigmas
-from sst_graph.covariance.cluster_robust import RobustCovariance, covariance_of, robust_covariance
+from sst_graph.covariance.cluster_robust import RobustCovariance, covariance_of
 from sst_graph.covariance.considered import AssumptionConfig, Considered
 from sst_graph.covariance.error_model import fit_error_model
 from sst_graph.covariance.image_shifts import columns_by_image, shifts_of
@@ -194,6 +194,7 @@ class LinearProblem:
         values: of the free parameters at the optimum, by name.
         state: the optimum.
         by_image: derivatives of the residuals by shifts of their image, and its number.
+        known: (n, n) information that is not of the matches; None without any.
     """
 
     table: MatchTable
@@ -202,6 +203,7 @@ class LinearProblem:
     values: dict[str, float]
     state: State
     by_image: tuple[FloatArray, IntArray]
+    known: FloatArray | None
 
     @classmethod
     def of(cls, problem: SolvedProblem, names: Sequence[str]) -> LinearProblem:
@@ -219,14 +221,17 @@ class LinearProblem:
         state = state_from(at, solution.state, pairs)
         free = {name: state.nuisances[name] for name in names}
         by_image = columns_by_image(table, pairs, at, state)
-        return cls(table, unknowns, information, free, state, by_image)
+        prior = solution.problem.prior
+        known = None if prior is None else prior.information_on(unknowns)
+        return cls(table, unknowns, information, free, state, by_image, known)
 
     def alone(self, name: str, config: AssumptionConfig) -> ParameterTest:
         """Estimate of one parameter while the others of them are zero."""
         step, kept, bread = self._step_to(name)
         moved = self.table.after(step)
         table = _centred(replace(moved, J=moved.J[:, kept]), bread)
-        covariance = covariance_of(bread, table, fit_error_model(table.residuals))
+        known = None if self.known is None else self.known[np.ix_(kept, kept)]
+        covariance = covariance_of(bread, table, fit_error_model(table.residuals), known=known)
         column = self.unknowns.column(nuisance_key(name))
         place = int(np.searchsorted(kept, column))
         variance = float(covariance[place, place])
@@ -302,9 +307,7 @@ def _solved_alone(
         return finding
     if explained(solution) < explained(problem.solution):
         return None
-    robust = robust_covariance(
-        solution.graph, solution.values, solution.pairs, solution.state, problem.objects
-    )
+    robust = robust_of(solution, problem.objects)
     column = robust.unknowns.column(nuisance_key(name))
     by_image = columns_by_image(robust.table, solution.pairs, solution.values, solution.state)
     value, variance = solution.state.nuisances[name], float(robust.matrix[column, column])

@@ -127,9 +127,11 @@ def _little_agreement(
 
 def _outside_search(problem: CalibrationProblem, solution: JointSolution) -> Iterator[str]:
     search, guess = problem.config.search, problem.guess.cTl
-    around = np.zeros(3) if guess is None else guess.translation()
-    far = float(np.linalg.norm(solution.state.cTl.translation() - around))
-    if far > (REACH * search.free_translation_m if guess is None else 1.5 * search.translation_m):
+    away = solution.state.cTl.translation() - (np.zeros(3) if guess is None else guess.translation())
+    far = float(np.linalg.norm(away))
+    # A ball about the LiDAR, or a box about the guess.
+    of_region = far / search.free_translation_m if guess is None else abs(away).max() / search.translation_m
+    if of_region > REACH:
         what = "the guess" if guess is not None else "the LiDAR"
         yield f"the estimate lies {far:.2f} m from {what}, farther than was searched"
 

@@ -152,6 +152,12 @@ class MatchedDrives:
         return self.problem.fit_at(replace(self.state, cTl=at.cTl, time_offsets_s=(at.time_offset_s,)))
 
 
+def robust_of(solution: JointSolution, objects: Sequence[dict[ObjectId, int]]) -> RobustCovariance:
+    """The cluster-robust covariance of a solution."""
+    made_at, prior = solution.frozen.state, solution.problem.prior
+    return robust_covariance(solution.graph, solution.values, solution.pairs, made_at, objects, prior)
+
+
 @dataclass(frozen=True)
 class JointEstimate:
     """A solution and its covariance by the matches.
@@ -171,7 +177,7 @@ class JointEstimate:
     @classmethod
     def of(cls, solution: JointSolution, objects: Sequence[dict[ObjectId, int]]) -> JointEstimate:
         """The solution with the covariance of its last matches."""
-        robust = robust_covariance(solution.graph, solution.values, solution.pairs, solution.state, objects)
+        robust = robust_of(solution, objects)
         return cls(solution, robust, robust.matrix, static_covariance(robust, solution.pairs))
 
     def considered(self, config: AssumptionConfig) -> Considered:

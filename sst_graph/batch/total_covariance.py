@@ -65,7 +65,8 @@ def total_covariance(
     solution, joint = estimate.solution, problem.config.joint
     size = 6 + len(solution.state.time_offsets_s)
     # 1. Matches, pictures that shift from image to image, and assumptions.
-    motion = motion_covariance(estimate.robust, solution.pairs, solution.state, joint.graph)
+    prior = solution.problem.prior
+    motion = motion_covariance(estimate.robust, solution.pairs, solution.state, joint.graph, prior)
     shifts = image_shifts(estimate.robust, solution.pairs, solution.values, solution.state)
     parts = budget(estimate.covariance, motion, shifts.covariance, considered)
     unknowns = estimate.covariance[:size, :size] + shifts.covariance + considered.covariance(size)
@@ -146,7 +147,9 @@ def sweep_step(
         _retimed(own, timings[own.number]) if own.number in timings else own for own in solution.matches
     ]
     before, after = (
-        FrozenProblem(used, solution.state, config.graph).optimum(_ITERATIONS)[0]
+        FrozenProblem(
+            used, solution.frozen.state, config.graph, solution.centre, solution.problem.prior
+        ).optimum(_ITERATIONS)[0]
         for used in (solution.matches, retimed)
     )
     step = gtsam.Pose3.Logmap(before.cTl.between(after.cTl))

@@ -27,6 +27,7 @@ from sst_graph.covariance.jackknife import ObjectSpread, composed, steps_without
 from sst_graph.covariance.match_table import MatchTable, match_table
 from sst_graph.covariance.sums import ScoreSums
 from sst_graph.graph.elimination import Eliminated, Unknowns
+from sst_graph.graph.known import KnownCalibration
 from sst_graph.graph.matching import PairMatches
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import ObjectId
@@ -43,6 +44,7 @@ class RobustCovariance:
         model: the error model behind it.
         unknowns: its columns.
         table: the matches.
+        known: (n, n) information that is not of the matches, and is right as it is; None without any.
     """
 
     matrix: FloatArray
@@ -50,6 +52,7 @@ class RobustCovariance:
     model: ErrorModel
     unknowns: Unknowns
     table: MatchTable
+    known: FloatArray | None = None
 
 
 def robust_covariance(
@@ -58,29 +61,44 @@ def robust_covariance(
     pairs: Sequence[PairMatches],
     state: State,
     tracks: Sequence[dict[ObjectId, int]],
+    prior: KnownCalibration | None = None,
 ) -> RobustCovariance:
-    """Covariance of the unknowns that are not motion, from a frozen graph and its matches."""
+    """Covariance of the unknowns that are not motion, from a frozen graph and its matches.
+
+    Args:
+        state: that the matches were made at.
+        prior: what is known beside the matches, a factor of the graph.
+    """
     unknowns = Unknowns.of(state, pairs)
     eliminated = Eliminated.of(graph, values, unknowns)
     bread = eliminated.covariance()
     table = match_table(eliminated, values, pairs, state, tracks)
     model = fit_error_model(table.residuals)
-    return RobustCovariance(covariance_of(bread, table, model), bread, model, unknowns, table)
+    known = None if prior is None else prior.information_on(unknowns)
+    matrix = covariance_of(bread, table, model, known=known)
+    return RobustCovariance(matrix, bread, model, unknowns, table, known)
 
 
 def covariance_of(
-    bread: FloatArray, table: MatchTable, model: ErrorModel, scores: ScoreSums | None = None
+    bread: FloatArray,
+    table: MatchTable,
+    model: ErrorModel,
+    scores: ScoreSums | None = None,
+    known: FloatArray | None = None,
 ) -> FloatArray:
     """(n, n) covariance under an error model of the matches.
 
     Args:
         bread: (n, n) the same if all matches were independent.
         scores: of the matches, where they are known; by default from the table.
+        known: (n, n) information in the bread that is not of the matches: its part of the covariance is that
+            of its own errors, whatever those of the matches are.
     """
     scores = table.scores if scores is None else scores
-    covariance = bread + bread @ scores.excess(model) @ bread
+    of_known = np.zeros_like(bread) if known is None else bread @ known @ bread
+    covariance = bread - of_known + bread @ scores.excess(model) @ bread
     spread = ObjectSpread.of(steps_without_objects(table, bread), table.object_weights)
-    covariance = composed(covariance, spread, table.weight_curvature_ratio)
+    covariance = composed(covariance, spread, table.weight_curvature_ratio) + of_known
     return np.asarray(0.5 * (covariance + covariance.T))
 
 

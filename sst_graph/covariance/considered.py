@@ -206,11 +206,18 @@ def considered_by_steps(steps: Mapping[str, FloatArray], config: AssumptionConfi
 
 
 def motion_covariance(
-    robust: RobustCovariance, pairs: Sequence[PairMatches], state: State, config: GraphConfig
+    robust: RobustCovariance,
+    pairs: Sequence[PairMatches],
+    state: State,
+    config: GraphConfig,
+    prior: KnownCalibration | None = None,
 ) -> FloatArray:
     """(n, n) part of the covariance that is there because the LiDAR's motion is measured, not known.
 
     The difference to the same problem with a motion a thousand times as well known.
+
+    Args:
+        prior: what is known beside the matches.
     """
     known = [
         replace(pair, l_twist=replace(pair.l_twist, covariance=1e-6 * pair.l_twist.covariance))
@@ -219,6 +226,8 @@ def motion_covariance(
         for pair in pairs
     ]
     graph, values = joint_graph(known, state, config)
+    if prior is not None:
+        graph.add(prior.factor([*state.nuisances]))
     return np.asarray(robust.bread - marginal_covariance(graph, values, robust.unknowns))
 
 

@@ -4,7 +4,8 @@ A mount that vibrates or pictures that are stabilised move all contours of an im
 move each point by its own motion. Neighbouring objects then err together, which the error model of single
 sides (:mod:`sst_graph.covariance.error_model`) does not know. The matches of each image are fitted with a
 shift of its picture and of its stamp; what these vary by beyond their own variances is their variance s^2
-(random effects: DerSimonian and Laird, Meta-analysis in clinical trials, 1986). With J_k and H_k the rows of
+(random effects: DerSimonian and Laird, Meta-analysis in clinical trials, 1986). Under robust weights, which
+are frozen, such a fit falls short by the ratio of mean curvature to mean weight. With J_k and H_k the rows of
 image k by the unknowns and by its shifts, and P the inverse of the information, they add
 
     sum_k P J_k'H_k diag(s^2) H_k'J_k P.
@@ -24,6 +25,7 @@ import numpy as np
 
 from sst_graph.covariance.cluster_robust import RobustCovariance
 from sst_graph.covariance.considered import columns_of, weighted_columns
+from sst_graph.covariance.jackknife import bounded_ratio
 from sst_graph.covariance.match_table import MatchTable
 from sst_graph.covariance.sums import summed_rows
 from sst_graph.covariance.undecided_sweep import MATTERS
@@ -139,7 +141,7 @@ def shifts_of(table: MatchTable, bread: FloatArray, H: FloatArray, images: IntAr
     # 1. The variance of the shifts.
     r = table.root_weights * table.r
     moments = sum((shift_moments(H[own], r[own], table.sides[own]) for own in members), NO_MOMENTS)
-    variances = shift_variances(moments)
+    variances = shift_variances(moments) * bounded_ratio(table.weight_curvature_ratio) ** 2
     # 2. What it does to the estimate.
     effects = [bread @ (table.J[own].T @ H[own]) for own in members]
     parts = [sum(np.outer(G[:, k], G[:, k]) for G in effects) * variances[k] for k in range(3)]

@@ -37,7 +37,8 @@ def static_covariance(robust: RobustCovariance, pairs: Sequence[PairMatches]) ->
     root = np.asarray(np.linalg.cholesky(robust.bread), np.float64)
     shares, axes = np.linalg.eigh(root.T @ gram(J) @ root)
     wider = root @ (axes / np.sqrt(1.0 - np.minimum(shares, _ALL)))
-    return covariance_of(wider @ wider.T, robust.table.take(np.flatnonzero(~dynamic)), robust.model)
+    table = robust.table.take(np.flatnonzero(~dynamic))
+    return covariance_of(wider @ wider.T, table, robust.model, known=robust.known)
 
 
 def dynamic_matches(pair: PairMatches) -> NDArray[np.bool_]:

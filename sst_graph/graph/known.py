@@ -10,6 +10,7 @@ import numpy as np
 
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.factors.camera import PinholeCamera
+from sst_graph.graph.elimination import Unknowns
 from sst_graph.graph.linear import quadratic_factor
 from sst_graph.graph.state import EXTRINSIC, State, nuisance_key, time_offset_key
 from sst_graph.types import FloatArray
@@ -46,6 +47,15 @@ class KnownCalibration:
     def shared(self, names: Sequence[str]) -> FloatArray:
         """(7, k) information that extrinsic and offset share with parameters."""
         return np.asarray(self.information @ self.columns(names), np.float64)
+
+    def information_on(self, unknowns: Unknowns) -> FloatArray:
+        """(n, n) information on all unknowns, estimated parameters that the mean follows among them."""
+        jacobian = np.zeros((7, unknowns.size))
+        jacobian[:, :7] = np.eye(7)
+        for name, step in self.steps.items():
+            if nuisance_key(name) in unknowns.keys:
+                jacobian[:, unknowns.column(nuisance_key(name))] = step
+        return np.asarray(jacobian.T @ self.information @ jacobian)
 
     def factor(self, free: Sequence[str] = ()) -> gtsam.LinearContainerFactor:
         """[Log(E_0^-1 E); D - D_0] + s theta, linear about the mean (E_0, D_0).

@@ -359,7 +359,7 @@ def poor_fit(explained: float, concentration: float, rotation_observable: bool) 
 
 
 def _seen(solution: JointSolution) -> int:
-    return max(1, sum(int(own.found.seen[own.counts > 0].sum()) for own in solution.matches))
+    return max(1, sum(int(own.found.seen.sum()) for own in solution.matches))
 
 
 def _check_matches(matches: int, pairs: int, config: JointConfig, edges: Sequence[DriveEdges]) -> None:

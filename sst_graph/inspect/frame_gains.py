@@ -125,7 +125,7 @@ def _left_out(
     # All gradients sum to nothing at the optimum: those of the others to minus this one's.
     table = robust.table.take(kept).after(-bread[:, term.columns] @ term.vector)
     others = sums.scores - total(len(bread), (scores,), (term.columns,))
-    return covariance_of(bread, table, fit_error_model(table.residuals), others)
+    return covariance_of(bread, table, fit_error_model(table.residuals), others, robust.known)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import numpy as np
 
 from sst_graph.covariance.error_model import ErrorModel, SideResiduals, fit_error_model
 from sst_graph.covariance.image_shifts import NO_MOMENTS, shift_variances
-from sst_graph.covariance.jackknife import curvature_ratio
+from sst_graph.covariance.jackknife import bounded_ratio, curvature_ratio
 from sst_graph.covariance.sums import ScoreSums, total
 from sst_graph.tracker.sums.linearized_pair import LinearizedPair
 from sst_graph.tracker.sums.object_sums import ObjectSums
@@ -139,7 +139,7 @@ class RunningSums:
     @property
     def shift_variances(self) -> FloatArray:
         """(3,) variances of the shifts of pictures [px^2, px^2] and of their stamps [s^2] over the images."""
-        return shift_variances(self.shifts)
+        return shift_variances(self.shifts) * bounded_ratio(self.weight_curvature_ratio) ** 2
 
     @property
     def shift_excess(self) -> FloatArray:
