@@ -178,7 +178,7 @@ class IncrementalTerms:
     def _rematch(self, rounds: int) -> IncrementalUpdate:
         rematched, converged, estimate = 0, False, self._solver.calculateEstimate()
         first_warnings: list[TermWarning] = []
-        alone = None if self._matches() else self._marginal()[:7, :7]
+        alone = self._marginal()[:7, :7] if self._start is None else None
         covariance, found = np.zeros((7, 7)), None
         for _ in range(rounds):
             self._retire(estimate)
@@ -187,7 +187,7 @@ class IncrementalTerms:
                 break
             rematched += swapped
             before, estimate = estimate, self._solver.calculateEstimate()
-            if alone is not None:
+            if alone is not None and self._matches():
                 first_warnings = wide_uncertainty(self._matches(), before, alone)
                 self._start_warnings = first_warnings
                 self._start, alone = (before, alone), None
