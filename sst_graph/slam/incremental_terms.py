@@ -8,7 +8,7 @@ take the place of the old ones. Kernel, proximal prior and the scale of the info
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -303,10 +303,10 @@ class IncrementalTerms:
 
         Their sums are kept from when their poses were last there.
         """
-        for placed in self._terms:
-            if placed.is_gone(estimate):
-                self._gone = self._gone + placed.sums
-        self._terms = [placed for placed in self._terms if not placed.is_gone(estimate)]
+        gone = [placed for placed in self._terms if placed.is_gone(estimate, self._stamps)]
+        for placed in gone:
+            self._gone = self._gone + placed.sums
+        self._terms = [placed for placed in self._terms if placed not in gone]
 
     def _matches(self) -> list[TermMatches]:
         return [p.matches for p in self._terms if p.matches is not None and p.matches.factor is not None]
@@ -433,12 +433,19 @@ class _Placed:
     def set(self, matches: TermMatches, sums: TermSums) -> None:
         self.matches, self.sums, self.slots = matches, sums, {}
 
-    def is_gone(self, estimate: gtsam.Values) -> bool:
-        """Whether a pose of its factor, or every pose it could be on, has left the solver."""
-        place = None if self.matches is None else self.matches.place
-        if place is not None and not all(estimate.exists(key) for key in place.poses):
-            return True
-        return self.matches is not None and self.matches.state == TermState.BEFORE_TRAJECTORY
+    def is_gone(self, estimate: gtsam.Values, known: Container[int]) -> bool:
+        """Whether a pose of its factor, or every pose it could be on, has left the solver.
+
+        known: poses that a smoother has been given; of another solver none, for there they stay.
+        """
+        if self.matches is None:
+            return False
+        if self.matches.place is not None:
+            return not all(estimate.exists(key) for key in self.matches.place.poses)
+        if self.matches.state != TermState.BEFORE_TRAJECTORY:
+            return False
+        first, _ = self.term.keys.trajectory.at(0)
+        return first in known and not estimate.exists(first)
 
 
 def _factors(graph: gtsam.NonlinearFactorGraph) -> list[gtsam.NonlinearFactor]:

@@ -10,6 +10,8 @@ import pytest
 from alignment_streets import D, E, Street, X, isam2_params, simulated_street
 
 from sst_graph import AlignmentKeys, IncrementalTerms, Trajectory
+from sst_graph.factors import time_offset_prior
+from sst_graph.slam.alignment_term import TermState
 from sst_graph.slam.config import RematchConfig
 from sst_graph.slam.incremental_terms import IncrementalUpdate, Solver
 from sst_graph.slam.term_warnings import WarningKind
@@ -123,3 +125,22 @@ def test_a_gap_keeps_its_warnings(street: Street) -> None:
     for k in range(7, 13):
         gap = online.update(k, with_image=False)
     assert {WarningKind.FAR_FROM_START} <= kinds(before) & kinds(gap)
+
+
+@pytest.mark.parametrize("kind", ["ISAM2", "smoother"])
+def test_a_term_before_the_trajectory_waits(street: Street, kind: str) -> None:
+    """An offset that begins 80 ms early has the first image before the first pose, until it is known."""
+    start = street.cTl, street.time_offset_s - 0.08
+    for steps in (2, 6):  # until the first pose has left the smoother
+        solver = gtsam.ISAM2(isam2_params()) if kind == "ISAM2" else None
+        online = Online(street, start, (0.05, 0.1, 0.1), solver)
+        for k in range(steps):
+            update = online.update(k, with_image=k == 0)
+        assert update.values.exists(X(0)) == (kind == "ISAM2" or steps == 2)
+        waits = update.values.exists(X(0))
+        assert update.waiting == ({TermState.BEFORE_TRAJECTORY: 1} if waits else {})
+        assert update.rematched == 0 and not update.converged
+        told = gtsam.NonlinearFactorGraph()
+        told.add(time_offset_prior(D, street.time_offset_s, 1e-4))
+        after = online.terms.update(told, gtsam.Values())
+        assert not after.waiting and (after.rematched > 0) == waits
