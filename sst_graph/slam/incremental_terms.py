@@ -8,7 +8,7 @@ take the place of the old ones. Kernel, proximal prior and the scale of the info
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -69,9 +69,11 @@ class IncrementalUpdate:
     Attributes:
         values: the estimate.
         covariance: (7, 7) cluster-robust, of extrinsic and offset, once the kernel has its last scale; until
-            then the solver's marginal, proximal prior included.
+            then the solver's marginal, proximal prior included. In a gap, when no term has a factor, that of
+            the terms whose poses a smoother has marginalized.
         kernel_px: scale of the kernel [px].
-        converged: the kernel has its last scale, the proximal prior is gone, no term needs matching.
+        converged: the kernel has its last scale, the proximal prior is gone, no term needs matching; so it
+            stays in a gap.
         rematched: how many factors were swapped.
         waiting: terms that have no factor, and why.
         warnings: what may be wrong; of the start, at the first matches and by ``converge``.
@@ -111,7 +113,7 @@ class IncrementalTerms:
         self._kernel_px = self._config.first_px
         self._with_proximal, self._information = True, 1.0
         self._sides = ObjectSides()
-        self._gone = TermSums()
+        self._gone, self._errors = TermSums(), least_errors(self._config)
         self._start: tuple[gtsam.Values, FloatArray] | None = None
         self._start_warnings: list[TermWarning] = []
         self._begun, self._has_new_terms = False, False
@@ -155,7 +157,8 @@ class IncrementalTerms:
         """Rounds of matching without anything new, until they change nothing.
 
         Where terms have come since the last time, the kernel is wide again first: it was narrowed by the
-        first images, which may not tell a shift forward from an image taken later.
+        first images, which may not tell a shift forward from an image taken later. Not so in a gap, when no
+        term can have a factor: it would not be narrowed again.
 
         Raises:
             FactorError: no number of rounds.
@@ -168,7 +171,7 @@ class IncrementalTerms:
             raise EstimationError(
                 "IncrementalTerms.converge: found no update before it, expected one or more"
             )
-        if self._has_new_terms:
+        if self._has_new_terms and self._can_match():
             self._kernel_px, self._with_proximal, self._has_new_terms = self._config.first_px, True, False
         update = self._rematch(rounds)
         return replace(update, warnings=tuple(dict.fromkeys((*self._start_warnings, *update.warnings))))
@@ -178,25 +181,21 @@ class IncrementalTerms:
     def _rematch(self, rounds: int) -> IncrementalUpdate:
         rematched, converged, estimate = 0, False, self._solver.calculateEstimate()
         first_warnings: list[TermWarning] = []
-        alone = None if self._matches() else self._marginal()[:7, :7]
-        covariance, found = np.zeros((7, 7)), None
+        alone = self._marginal()[:7, :7] if self._start is None else None
         for _ in range(rounds):
             self._retire(estimate)
-            swapped = self._swap(estimate)
-            if not any(placed.matches for placed in self._terms):
-                break
-            rematched += swapped
+            rematched += self._swap(estimate)
             before, estimate = estimate, self._solver.calculateEstimate()
-            if alone is not None:
+            if alone is not None and self._matches():
                 first_warnings = wide_uncertainty(self._matches(), before, alone)
                 self._start_warnings = first_warnings
                 self._start, alone = (before, alone), None
             covariance, found, converged = self._anneal(estimate)
-            if converged:
+            if converged or not self._matches():
                 break
         warnings = first_warnings
         matches = self._matches()
-        if matches and self._kernel_px == self._config.last_px:
+        if self._kernel_px == self._config.last_px:
             warnings = warnings + last_warnings(matches, estimate, covariance, self._config)
             point = self._solver.getLinearizationPoint()
             smoother = not isinstance(self._solver, gtsam.ISAM2)
@@ -244,19 +243,23 @@ class IncrementalTerms:
     def _robust(self, P: FloatArray, estimate: gtsam.Values) -> tuple[Robust, Robust]:
         """The robust covariance by the errors that the present frames show, and by the least ones.
 
-        Frames that have left count by their sums.
+        Frames that have left count by their sums; where there are no others, with the errors shown last.
         """
         matches = self._matches()
         rows = [rows_of(each, self._sides, estimate) for each in matches]
         sums = total(TermSums.of(each, m.information) for each, m in zip(rows, matches, strict=True))
         sums = sums + self._gone
-        config = self._config
-        errors = fit_errors(rows, config), least_errors(config)
+        if rows:
+            self._errors = fit_errors(rows, self._config)
+        errors = self._errors, least_errors(self._config)
         found, least = (robust_covariance(P, sums, each, self._keys) for each in errors)
         return found, least
 
     def _swap(self, estimate: gtsam.Values) -> int:
-        """Match terms that need it; new factors in, old ones and the old proximal prior out, at once."""
+        """Match terms that need it; new factors in, old ones and the old proximal prior out, at once.
+
+        Gives how many new factors of terms there are.
+        """
         changed = [placed for placed in self._terms if self._needs_matching(placed, estimate)]
         graph, owners, removed = gtsam.NonlinearFactorGraph(), list[_Placed | None](), list[int]()
         for placed in changed:
@@ -279,7 +282,7 @@ class IncrementalTerms:
             for owner, slot in zip(owners, slots, strict=True):
                 owned = self._proximal if owner is None else owner.slots
                 owned[slot] = self._graph().at(slot)
-        return len(changed)
+        return sum(bool(placed.slots) for placed in changed)
 
     def _sums(self, matches: TermMatches, estimate: gtsam.Values) -> TermSums:
         return TermSums.of(rows_of(matches, self._sides, estimate), matches.information)
@@ -300,13 +303,20 @@ class IncrementalTerms:
 
         Their sums are kept from when their poses were last there.
         """
-        for placed in self._terms:
-            if placed.is_gone(estimate):
-                self._gone = self._gone + placed.sums
-        self._terms = [placed for placed in self._terms if not placed.is_gone(estimate)]
+        gone = [placed for placed in self._terms if placed.is_gone(estimate, self._stamps)]
+        for placed in gone:
+            self._gone = self._gone + placed.sums
+        self._terms = [placed for placed in self._terms if placed not in gone]
 
     def _matches(self) -> list[TermMatches]:
         return [p.matches for p in self._terms if p.matches is not None and p.matches.factor is not None]
+
+    def _can_match(self) -> bool:
+        """Whether a term has a factor, or would have one under the widest kernel."""
+        if self._matches():
+            return True
+        estimate, first_px = self._solver.calculateEstimate(), self._config.first_px
+        return any(placed.term.matched(estimate, first_px).factor is not None for placed in self._terms)
 
     def _waiting(self) -> dict[TermState, int]:
         states = [p.matches.state for p in self._terms if p.matches is not None and p.matches.factor is None]
@@ -423,12 +433,19 @@ class _Placed:
     def set(self, matches: TermMatches, sums: TermSums) -> None:
         self.matches, self.sums, self.slots = matches, sums, {}
 
-    def is_gone(self, estimate: gtsam.Values) -> bool:
-        """Whether a pose of its factor, or every pose it could be on, has left the solver."""
-        place = None if self.matches is None else self.matches.place
-        if place is not None and not all(estimate.exists(key) for key in place.poses):
-            return True
-        return self.matches is not None and self.matches.state == TermState.BEFORE_TRAJECTORY
+    def is_gone(self, estimate: gtsam.Values, known: Container[int]) -> bool:
+        """Whether a pose of its factor, or every pose it could be on, has left the solver.
+
+        known: poses that a smoother has been given; of another solver none, for there they stay.
+        """
+        if self.matches is None:
+            return False
+        if self.matches.place is not None:
+            return not all(estimate.exists(key) for key in self.matches.place.poses)
+        if self.matches.state != TermState.BEFORE_TRAJECTORY:
+            return False
+        first, _ = self.term.keys.trajectory.at(0)
+        return first in known and not estimate.exists(first)
 
 
 def _factors(graph: gtsam.NonlinearFactorGraph) -> list[gtsam.NonlinearFactor]:

@@ -6,6 +6,8 @@ cluster. Objects are followed by the centre of their matched points, near where 
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import gtsam
@@ -19,6 +21,10 @@ from sst_graph.types import FloatArray, SemanticClass
 SAME_OBJECT_M = 1.5
 """Centres of an object's matched points in consecutive images lie nearer than this [m]: parked vehicles
 stand at least a vehicle's width apart, and what is seen of one moves by decimetres from image to image."""
+
+_Cell = tuple[SemanticClass, int, int, int]
+"""A class, and a cube of the world with edges of :data:`SAME_OBJECT_M`, by number along each axis."""
+_NEIGHBOURS = tuple(itertools.product((-1, 0, 1), repeat=3))
 
 
 @dataclass
@@ -35,7 +41,8 @@ class ObjectSides:
     def __init__(self) -> None:
         self._origin: FloatArray | None = None
         self._tracks: list[_Track] = []
-        self._names: dict[tuple[int, SemanticClass, int], int] = {}
+        self._cells: dict[_Cell, set[int]] = {}
+        self._names: dict[tuple[int, SemanticClass], dict[int, int]] = {}
 
     def of(self, scan_ns: int, found: FrameAlignments, wTl: gtsam.Pose3) -> list[NDArray[np.intp]]:
         """For each alignment, (n,) number of the side that each match lies on.
@@ -66,23 +73,39 @@ class ObjectSides:
 
     def _track(self, name: tuple[int, SemanticClass, int], centre: FloatArray) -> int:
         """The track of an object of a scan: the nearest of its class that the scan has not named yet."""
-        if name not in self._names:
-            self._names[name] = self._nearest(name[0], name[1], centre)
-        track = self._names[name]
-        self._tracks[track].place = centre
-        return track
+        scan_ns, semantic_class, number = name
+        names = self._names.setdefault((scan_ns, semantic_class), {})
+        if number not in names:
+            names[number] = self._nearest(semantic_class, centre, names.values())
+        self._move(names[number], centre)
+        return names[number]
 
-    def _nearest(self, scan_ns: int, semantic_class: SemanticClass, centre: FloatArray) -> int:
-        taken = {
-            track for (stamp, c, _), track in self._names.items() if (stamp, c) == (scan_ns, semantic_class)
-        }
+    def _nearest(self, semantic_class: SemanticClass, centre: FloatArray, taken: Collection[int]) -> int:
+        """The track nearest to a place, of a class and not taken; a new one where none is near.
+
+        Only the cells around the place are looked at: a drive passes objects without end.
+        """
+        _, i, j, k = _cell(semantic_class, centre)
         near = [
-            (float(np.linalg.norm(track.place - centre)), k)
-            for k, track in enumerate(self._tracks)
-            if track.semantic_class == semantic_class and k not in taken
+            (float(np.linalg.norm(self._tracks[track].place - centre)), track)
+            for a, b, c in _NEIGHBOURS
+            for track in self._cells.get((semantic_class, i + a, j + b, k + c), ())
+            if track not in taken
         ]
         distance, nearest = min(near, default=(np.inf, -1))
         if distance <= SAME_OBJECT_M:
             return nearest
         self._tracks.append(_Track(semantic_class, centre))
         return len(self._tracks) - 1
+
+    def _move(self, track: int, centre: FloatArray) -> None:
+        """The track was seen at a place."""
+        semantic_class, place = self._tracks[track].semantic_class, self._tracks[track].place
+        self._cells.get(_cell(semantic_class, place), set()).discard(track)
+        self._cells.setdefault(_cell(semantic_class, centre), set()).add(track)
+        self._tracks[track].place = centre
+
+
+def _cell(semantic_class: SemanticClass, place: FloatArray) -> _Cell:
+    i, j, k = (int(number) for number in np.floor(place / SAME_OBJECT_M))
+    return semantic_class, i, j, k
