@@ -310,16 +310,20 @@ class Tracker:
         self.monitor.begin(window.next_scan)
         return make_update(self, stamp_ns)
 
+    @property
+    def _near(self) -> StartGuess:
+        """Where the calibration is searched again: at the estimate; at the guess while there is none."""
+        point, guess = self.estimate.point, self.initializer.guess
+        return StartGuess(point.cTl, point.time_offset_s, guess.search) if self.estimate.exists else guess
+
     def _restart_by_stamps(self, clock_step_ns: int, jump: Jump | None) -> Restart | None:
         """The restart after a jump of the stamps: a clock was set, or stamps jumped against their
         interval."""
-        window, point, guess = self.inputs.window, self.estimate.point, self.initializer.guess
+        window, guess = self.inputs.window, self.initializer.guess
         if clock_step_ns:
             moved = f"the scan stamps moved by {1e-9 * clock_step_ns:+.3f} s and go on from there"
-            near = StartGuess(point.cTl, point.time_offset_s, guess.search)
-            return Restart(
-                near, len(window.scans), f"{moved}: the calibration is estimated again", alarm=True
-            )
+            why = f"{moved}: the calibration is estimated again"
+            return Restart(self._near, len(window.scans), why, alarm=self.estimate.exists)
         if jump is None:
             return None
         image, scan = jump.place
@@ -369,9 +373,8 @@ class Tracker:
                 _LOG.error("tracker: an error while a %s was added", sensor, exc_info=error)
             why = " ".join(f"{type(error).__name__}: {error}".split())[:300]
             if self.inputs.failed(why):
-                point, guess = self.estimate.point, self.initializer.guess
                 self.inputs.restart()
-                self._restart(Restart(StartGuess(point.cTl, point.time_offset_s, guess.search), 0, why), 0)
+                self._restart(Restart(self._near, 0, why), 0)
                 why = f"{why}; the calibration is estimated again"
         stamp_ns = data.stamp_ns if isinstance(data, Scan | CameraImage) else 0
         known = isinstance(stamp_ns, int | np.integer) and abs(int(stamp_ns)) <= LATEST_NS

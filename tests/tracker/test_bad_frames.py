@@ -18,6 +18,7 @@ from sst_graph import CalibrationConfig, PinholeCamera, Tracker
 from sst_graph.batch.config import Method
 from sst_graph.errors import DataError, SstGraphError
 from sst_graph.files.object_store import stored
+from sst_graph.odometry.lidar import LidarOdometry
 from sst_graph.simulator import SimulatedDrive
 from sst_graph.types import NO_PICTURE, CameraImage, Frame, PixelStretch, Scan
 from sst_graph.validation import checked_image, checked_scan
@@ -338,6 +339,21 @@ def test_one_slip_of_a_clock_is_refused_and_a_clock_that_was_set_is_not(
     assert not tracker.estimate.exists and len(tracker.inputs.window.scans) == 4
 
 
+@pytest.mark.parametrize("guessed", [False, True])
+def test_a_clock_that_is_set_before_the_first_estimate_is_no_alarm(
+    street: SimulatedDrive, frames: list[Frame], guessed: bool
+) -> None:
+    """The guess stays what it was: none, where nothing was known."""
+    guess = street.nominal if guessed else None
+    tracker, day = Tracker(street.camera, initial=guess), 86_400 * 10**9
+    updates = [tracker.add_scan(_later(frame.scan, -day * (frame.index >= 3))) for frame in frames[:8]]
+    assert [bool(update.refused) for update in updates] == [False] * 3 + [True] * 4 + [False]
+    assert "scan stamps moved by -86399" in updates[-1].reason
+    assert not updates[-1].alarm and updates[-1].status == "starting"
+    assert tracker.initializer.guess.cTl is guess
+    assert (tracker.estimate.guessed_point is None) == (guess is None)
+
+
 def _later(scan: Scan | None, by_ns: int) -> Scan:
     assert scan is not None
     return dataclasses.replace(scan, stamp_ns=scan.stamp_ns + by_ns)
@@ -401,6 +417,19 @@ def test_after_ten_failures_in_a_row_the_window_is_given_up(running: Path, frame
     assert all(update.refused == ("scan",) for update in updates[:10])
     assert "estimated again" in updates[9].reason and not updates[10].refused
     assert not tracker.estimate.exists
+
+
+def test_ten_failures_before_the_first_estimate_leave_the_guess(
+    street: SimulatedDrive, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        raise ValueError("no motion")
+
+    monkeypatch.setattr(LidarOdometry, "add", fails)
+    tracker = Tracker(street.camera)
+    updates = [tracker.add_scan(frame.scan) for frame in frames[:10]]
+    assert "estimated again" in updates[-1].reason
+    assert tracker.initializer.guess.cTl is None and tracker.estimate.guessed_point is None
 
 
 def test_a_tracker_still_works_after_all_that(running: Path, frames: list[Frame]) -> None:
