@@ -254,7 +254,7 @@ class Tracker:
             with Snapshot(self.inputs):
                 # 2. Its contours go into the window.
                 self.inputs.add_image(checked, clock_step_ns, self.estimate)
-                return make_update(self, checked.stamp_ns) if with_update else None
+                return make_update(self, checked.stamp_ns, sensor="image") if with_update else None
         except Exception as error:
             return self._not_added("image", image, error)
 
@@ -378,4 +378,5 @@ class Tracker:
                 why = f"{why}; the calibration is estimated again"
         stamp_ns = data.stamp_ns if isinstance(data, Scan | CameraImage) else 0
         known = isinstance(stamp_ns, int | np.integer) and abs(int(stamp_ns)) <= LATEST_NS
-        return dataclasses.replace(make_update(self, int(stamp_ns) if known else 0, why), refused=(sensor,))
+        update = make_update(self, int(stamp_ns) if known else 0, why, sensor=sensor)
+        return dataclasses.replace(update, refused=(sensor,))

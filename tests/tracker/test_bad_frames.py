@@ -504,6 +504,18 @@ def test_a_frozen_sensor_is_named_and_moves_no_estimate(
     assert f"a frozen {'camera' if sensor == 'image' else 'LiDAR'}" in tracker.result().reasons[-1]
 
 
+def test_an_image_of_a_camera_ahead_ages_no_estimate(running: Path, frames: list[Frame]) -> None:
+    """The time since the last scan is true time, whatever the camera's clock."""
+    usual, ahead = Tracker.load(running), Tracker.load(running)
+    smoother, image = ahead.estimate.smoother, frames[14].image
+    assert smoother is not None and image is not None
+    smoother.point = dataclasses.replace(smoother.point, time_offset_s=smoother.point.time_offset_s - 2.0)
+    later = dataclasses.replace(image, stamp_ns=image.stamp_ns + 2_000_000_000)
+    a, b = usual.add_image(image), ahead.add_image(later)
+    assert b.stamp_ns == a.stamp_ns + 2_000_000_000
+    assert b.unconfirmed_s == pytest.approx(a.unconfirmed_s) and b.status == a.status
+
+
 def test_equal_frames_of_a_standing_vehicle_are_right(running: Path, frames: list[Frame]) -> None:
     tracker = Tracker(Tracker.load(running).setup.camera)
     assert not any(tracker.add(frame).refused for frame in _frozen(frames[:6], 1, "image", "scan"))
