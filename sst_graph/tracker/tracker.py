@@ -57,7 +57,7 @@ class Tracker:
         initializer: the start that is being made.
         estimate: extrinsic, time offset and their covariance.
         monitor: whether the calibration has changed, and which one to use.
-        last_update: of the last frame given to :meth:`add`, or None.
+        last_update: of the last frame, scan or image that was given, or None.
     """
 
     def __init__(
@@ -110,42 +110,18 @@ class Tracker:
 
     def add_image(self, image: CameraImage) -> TrackUpdate:
         """Add an image; it is used as soon as a scan close to it in true time is there."""
-        update = self._use_image(image, with_update=True)
+        self.last_update = update = self._use_image(image, with_update=True)
         assert update is not None
         return update
 
-    @with_usual_errors
     def add_scan(self, scan: Scan, frame: int | None = None) -> TrackUpdate:
         """Add a scan, and estimate; where anything fails, everything is as it was.
 
         Args:
             frame: its number in the drive, by which the result names it; None: scans are counted.
         """
-        try:
-            # 1. Check the scan, its number and its stamp.
-            frame = None if frame is None else checked_index(frame)
-            checked, clock_step_ns = self.inputs.check_scan(scan)
-            with Snapshot(self):
-                # 2. Its boundary points, and the motion that led to it, go into the window.
-                jump = self.inputs.add_scan(checked, clock_step_ns, self.estimate, frame)
-                # 3. Restart where stamps jumped: earlier frames have another time offset.
-                if restart := self._restart_by_stamps(clock_step_ns, jump):
-                    return self._restart(restart, checked.stamp_ns)
-                # 4. Without an estimate: some work on the initialization.
-                if not self.estimate.exists:
-                    return self._initialize(checked.stamp_ns)
-                # 5. Match new scans, and some of the window again.
-                matches = self.estimate.match(self.inputs.window.next_scan - 1)
-                # 6. Change detection: compare new frames with the estimate before they are used.
-                chi2, change = self.monitor.check(matches, self.estimate)
-                if change is not None:
-                    return self._restart(change, checked.stamp_ns)
-                # 7. Add the matches to the graph, and estimate.
-                self.estimate.update(matches)
-                # 8. Check the start against later frames; adopt the estimate where held-out frames agree.
-                return self._review(matches, checked.stamp_ns, chi2)
-        except Exception as error:
-            return self._not_added("scan", scan, error)
+        self.last_update = update = self._use_scan(scan, frame)
+        return update
 
     @with_usual_errors
     def optimize(self, max_iterations: int = 20) -> TrackUpdate:
@@ -258,13 +234,42 @@ class Tracker:
         except Exception as error:
             return self._not_added("image", image, error)
 
+    @with_usual_errors
+    def _use_scan(self, scan: Scan, frame: int | None) -> TrackUpdate:
+        """Add a scan, and estimate."""
+        try:
+            # 1. Check the scan, its number and its stamp.
+            frame = None if frame is None else checked_index(frame)
+            checked, clock_step_ns = self.inputs.check_scan(scan)
+            with Snapshot(self):
+                # 2. Its boundary points, and the motion that led to it, go into the window.
+                jump = self.inputs.add_scan(checked, clock_step_ns, self.estimate, frame)
+                # 3. Restart where stamps jumped: earlier frames have another time offset.
+                if restart := self._restart_by_stamps(clock_step_ns, jump):
+                    return self._restart(restart, checked.stamp_ns)
+                # 4. Without an estimate: some work on the initialization.
+                if not self.estimate.exists:
+                    return self._initialize(checked.stamp_ns)
+                # 5. Match new scans, and some of the window again.
+                matches = self.estimate.match(self.inputs.window.next_scan - 1)
+                # 6. Change detection: compare new frames with the estimate before they are used.
+                chi2, change = self.monitor.check(matches, self.estimate)
+                if change is not None:
+                    return self._restart(change, checked.stamp_ns)
+                # 7. Add the matches to the graph, and estimate.
+                self.estimate.update(matches)
+                # 8. Check the start against later frames; adopt the estimate where held-out frames agree.
+                return self._review(matches, checked.stamp_ns, chi2)
+        except Exception as error:
+            return self._not_added("scan", scan, error)
+
     def _add_sensors(self, frame: Frame) -> TrackUpdate:
         """Add a frame's image, then its scan."""
         of_image = None if frame.image is None else self._use_image(frame.image, frame.scan is None)
         if frame.scan is None:
             assert of_image is not None
             return of_image
-        update = self.add_scan(frame.scan, frame.index)
+        update = self._use_scan(frame.scan, frame.index)
         if of_image is None:
             return update
         reason = "; ".join(filter(None, (of_image.reason, update.reason)))

@@ -108,6 +108,12 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+def _state(tracker: Tracker) -> tuple[Any, bytes]:
+    """All that a tracker holds, but for what it answered last."""
+    tracker.last_update = None
+    return stored(tracker)
+
+
 def _bad(rng: Rng, frames: list[Frame], count: int) -> Iterator[Frame]:
     """Frames of which the scan, the image or both have been tampered with."""
     for k in range(count):
@@ -143,21 +149,20 @@ def test_nothing_that_a_frame_brings_raises(running: Path, frames: list[Frame], 
     refused = 0
     for frame in _bad(rng, frames, 60):
         for add, data in ((tracker.add_image, frame.image), (tracker.add_scan, frame.scan)):
-            before = stored(tracker)
+            before = _state(tracker)
             update = add(data)  # type: ignore[operator]
             assert np.isfinite(update.sigmas).all() and np.isfinite(update.T_camera_lidar.matrix()).all()
             if update.refused:
                 refused += 1
                 assert update.reason and not update.accepted
-                assert stored(tracker) == before
+                assert _state(tracker) == before
     assert refused > 30
 
 
 def test_a_frame_may_be_anything(running: Path) -> None:
     """Only what was answered to it is remembered."""
     tracker = Tracker.load(running)
-    tracker.last_update = None
-    before = stored(tracker)
+    before = _state(tracker)
     for thing in (None, "frame", 3, np.zeros(3), Frame(0, None, None), Frame(0, "scan", {}), object()):
         update = tracker.add(thing)  # type: ignore[arg-type]
         assert not update.accepted and update.reason
@@ -165,19 +170,18 @@ def test_a_frame_may_be_anything(running: Path) -> None:
         update = tracker.add(Frame(index, None, None))  # type: ignore[arg-type]
         assert "frame: found an index" in update.reason
     assert tracker.last_update is not None and tracker.last_update.frame == 0
-    tracker.last_update = None
-    assert stored(tracker) == before
+    assert _state(tracker) == before
 
 
 def test_a_scan_s_number_is_one(running: Path, frames: list[Frame]) -> None:
     """Else the result could not be written, nor a checkpoint read."""
     tracker = Tracker.load(running)
-    before, scan = stored(tracker), frames[14].scan
+    before, scan = _state(tracker), frames[14].scan
     assert scan is not None
     for number in ("a", 1.5, True, np.zeros(2), 2**80, 10**5000):
         update = tracker.add_scan(scan, number)  # type: ignore[arg-type]
         assert update.refused == ("scan",) and "frame: found an index" in update.reason
-    assert stored(tracker) == before
+    assert _state(tracker) == before
     assert not tracker.add_scan(scan, np.int64(14)).refused  # type: ignore[arg-type]
 
 
@@ -368,14 +372,14 @@ def test_a_scan_that_cannot_be_estimated_with_is_taken_back(running: Path, frame
     tracker, other = Tracker.load(running), Tracker.load(running)
     scan = frames[14].scan
     assert scan is not None
-    before = stored(tracker)
+    before = _state(tracker)
     for broken in _hard_to_use(scan):
         update = tracker.add_scan(broken)
         if update.refused:
-            assert stored(tracker) == before
+            assert _state(tracker) == before
         else:  # it was of use after all
             tracker = Tracker.load(running)
-            before = stored(tracker)
+            before = _state(tracker)
     for frame in frames[14:18]:
         a, b = tracker.add(frame), other.add(frame)
         assert a.T_camera_lidar.equals(b.T_camera_lidar, 0.0) and a.time_offset_s == b.time_offset_s

@@ -98,6 +98,21 @@ def test_a_result_names_frames_by_their_numbers_in_the_drive(
             wrong()
 
 
+def test_what_is_told_of_the_last_data_is_theirs(running: Path, frames: list[Frame]) -> None:
+    """Whether frames are added, or scans and images alone."""
+    tracker, good = Tracker.load(running), frames[20]
+    assert good.scan is not None and good.image is not None and frames[21].image is not None
+    nothing = dataclasses.replace(good.scan, points=np.full_like(good.scan.points, np.nan))
+    refused = tracker.add(Frame(20, nothing, good.image))
+    assert refused.refused == ("scan",) and refused is tracker.last_update
+    scan = tracker.add_scan(good.scan)
+    told = current_update(tracker, tracker.last_update)
+    assert (told.stamp_ns, told.frame, told.refused) == (scan.stamp_ns, None, ())
+    assert told.accepted and told.chi2 == scan.chi2
+    image = tracker.add_image(frames[21].image)
+    assert current_update(tracker, tracker.last_update).stamp_ns == image.stamp_ns
+
+
 @pytest.mark.slow
 def test_what_leaves_the_window_still_counts(street: SimulatedDrive, frames: list[Frame]) -> None:
     whole, short = (
