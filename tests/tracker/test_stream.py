@@ -15,6 +15,7 @@ from sst_graph.covariance.cluster_robust import robust_covariance
 from sst_graph.covariance.image_shifts import image_shifts
 from sst_graph.errors import DataError, EstimationError
 from sst_graph.factors import FactorError
+from sst_graph.files.object_store import stored
 from sst_graph.graph.building import joint_graph, state_from
 from sst_graph.graph.drive_motion import motions_of
 from sst_graph.graph.matching import associate
@@ -22,8 +23,10 @@ from sst_graph.inspect.gained import gained_of
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.result import CalibrationResult
 from sst_graph.simulator import SimulatedDrive
+from sst_graph.tracker import estimate
 from sst_graph.tracker.track_update import current_update
 from sst_graph.tracker.window.epochs import MatchedPair
+from sst_graph.tracker.window.smoother import WindowSmoother
 from sst_graph.types import Frame
 
 
@@ -208,6 +211,35 @@ def test_an_update_that_fails_changes_nothing(running: Path, frames: list[Frame]
         smoother.update({scan: MatchedPair(pair, entry.linear, 0, entry.image)}, set(), 0)
     assert smoother.point is before and smoother.entries == entries
     assert tracker.add(frames[20]).accepted
+
+
+def test_a_solution_of_the_window_that_fails_changes_nothing(
+    running: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where its last step does, behind the update of the graph."""
+
+    def fails(*_: object) -> None:
+        raise EstimationError("no optimum")
+
+    tracker = Tracker.load(running)
+    monkeypatch.setattr(WindowSmoother, "optimize", fails)
+    before = stored(tracker)
+    update = tracker.optimize(1)
+    assert update.converged is None and stored(tracker) == before
+
+
+def test_an_epoch_that_has_no_match_in_the_end_stays_in_the_history(
+    running: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def solved(smoother: WindowSmoother, *_: object) -> bool:
+        smoother.retired += smoother.live_epochs()
+        return True
+
+    tracker = Tracker.load(running)
+    monkeypatch.setattr(estimate, "relinearize_window", solved)
+    before = tracker.estimate.history()
+    assert tracker.optimize().converged
+    assert len(tracker.estimate.history()) == len(before) + 1
 
 
 @pytest.mark.slow
