@@ -111,7 +111,8 @@ class OnlineEstimate:
         self.schedule = RelinearizationSchedule(window.first_scan, soon, self.config.window)
         self.entered.extend(smoother.entries)
         self.information_log.restart()
-        self.information_log.add(window.scans[-1][1].index, self.reported_covariance())
+        newest = max(smoother.entries, default=window.next_scan - 1)
+        self.information_log.add(window.frame(newest), self.reported_covariance())
         _LOG.info("tracker: started over %d scans", initialization.scans)
 
     def restart(self, guess: StartGuess) -> None:
@@ -255,10 +256,10 @@ class OnlineEstimate:
         self.entered.extend(new)
         # 2. At times the whole window is matched and linearized again, some scans with each frame.
         self._schedule_relinearization(matches.scan)
-        # 3. Covariance, and what the scan contributed to it.
+        # 3. Covariance, and what the scan contributed to it; the newest, where several enter.
         self.uncertainty = Uncertainty.of(smoother)
         if new:
-            self.information_log.add(window.scans[-1][1].index, self.reported_covariance())
+            self.information_log.add(window.frame(max(new)), self.reported_covariance())
         # 4. Test the assumptions, and whether edges still agree with the pictures.
         if matches.scan % EVERY == 0:
             self.findings = score_findings(smoother, self.config.calibration.assumptions)

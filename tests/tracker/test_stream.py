@@ -101,6 +101,18 @@ def test_a_result_names_frames_by_their_numbers_in_the_drive(
             wrong()
 
 
+def test_information_is_that_of_the_scan_that_entered(street: SimulatedDrive, frames: list[Frame]) -> None:
+    """Where images come late, a scan enters with the next one."""
+    tracker = tracker_from_truth(street)
+    for frame, late in zip(frames[5:16], frames[4:], strict=False):
+        tracker.add_scan(frame.scan, frame.index)
+        tracker.add_image(late.image)
+    gained = gained_of(tracker.result("drive"))
+    assert gained is not None
+    # The first estimate comes with the eighth scan.
+    assert [gain.frame.frame for gain in gained.gains] == [11, 12, 13, 14]
+
+
 def test_what_is_told_of_the_last_data_is_theirs(running: Path, frames: list[Frame]) -> None:
     """Whether frames are added, or scans and images alone."""
     tracker, good = Tracker.load(running), frames[20]

@@ -271,6 +271,10 @@ class Window:
             self.scans.popleft()
         self.dynamics.occupancy.forget(self.first_scan)
 
+    def frame(self, number: int) -> int:
+        """Number, in the drive, of the frame of a scan that is kept."""
+        return next(scan.index for own, scan in self.scans if own == number)
+
     def stamps_ns(self) -> dict[int, int]:
         """Stamp of each scan by its number."""
         return {number: scan.stamp_ns for number, scan in self.scans}
