@@ -49,7 +49,7 @@ class AlarmConfig(Settings):
     enabled: bool = setting(
         True,
         doc="Test each frame for a change of the calibration. Set to false to keep one estimate "
-        "whatever comes.",
+        "whatever frames show; a scan clock that is set still raises the alarm and begins a new one.",
     )
     chi2: float = setting(
         25.0,

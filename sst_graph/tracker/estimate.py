@@ -24,6 +24,7 @@ from sst_graph.tracker.history import MAX_EPOCHS, HistoryEntry, smoothed_epochs
 from sst_graph.tracker.monitor.statistic import ComparedEstimate
 from sst_graph.tracker.start.first_estimate import StartGuess
 from sst_graph.tracker.start.initializer import Initialization
+from sst_graph.tracker.storage.snapshot import Snapshot
 from sst_graph.tracker.uncertainty import Uncertainty
 from sst_graph.tracker.window.epochs import MatchedPair, RetiredEpoch
 from sst_graph.tracker.window.gaussian import Point
@@ -110,7 +111,8 @@ class OnlineEstimate:
         self.schedule = RelinearizationSchedule(window.first_scan, soon, self.config.window)
         self.entered.extend(smoother.entries)
         self.information_log.restart()
-        self.information_log.add(window.scans[-1][1].index, self.reported_covariance())
+        newest = max(smoother.entries, default=window.next_scan - 1)
+        self.information_log.add(window.frame(newest), self.reported_covariance())
         _LOG.info("tracker: started over %d scans", initialization.scans)
 
     def restart(self, guess: StartGuess) -> None:
@@ -254,15 +256,19 @@ class OnlineEstimate:
         self.entered.extend(new)
         # 2. At times the whole window is matched and linearized again, some scans with each frame.
         self._schedule_relinearization(matches.scan)
-        # 3. Covariance, and what the scan contributed to it.
+        # 3. Covariance, and what the scan contributed to it; the newest, where several enter.
         self.uncertainty = Uncertainty.of(smoother)
         if new:
-            self.information_log.add(window.scans[-1][1].index, self.reported_covariance())
+            self.information_log.add(window.frame(max(new)), self.reported_covariance())
         # 4. Test the assumptions, and whether edges still agree with the pictures.
         if matches.scan % EVERY == 0:
             self.findings = score_findings(smoother, self.config.calibration.assumptions)
         if self.edges is not None:
             self.edges.advance(self.matcher, smoother, self.guess.cTl)
+        self._take_over_retired(smoother)
+
+    def _take_over_retired(self, smoother: WindowSmoother) -> None:
+        """Keep the epochs that have left the window for the history."""
         self.past_epochs.extend(smoother.retired)
         smoother.retired.clear()
 
@@ -297,27 +303,30 @@ class OnlineEstimate:
     # ------------------------------------------------------------------ the whole window
 
     def optimize(self, max_iterations: int) -> bool | None:
-        """Solve the whole window as the batch does; whether it converged, None where that failed.
+        """Solve the whole window as the batch does; whether it converged, None where that failed and all is
+        as it was.
 
         It has converged where the last whole step was below 0.02 standard deviations.
         """
         smoother, window = self.smoother, self.matcher.window
         if smoother is None:
             return None
-        self.stop_relinearization()
-        window.dynamics.test_all()
-        self.matcher.check_lower_edges(smoother.point)
-        live = window.objects.live
         try:
-            converged = relinearize_window(
-                smoother, self.matcher, max_iterations, live, self._share, self.uncertainty.inflation
-            )
-            self.uncertainty = Uncertainty.of(smoother)
-            self.findings = score_findings(smoother, self.config.calibration.assumptions)
-            if self.edges is not None:
-                self.edges.finish(self.matcher, smoother, self.guess.cTl)
+            with Snapshot(self):
+                self.stop_relinearization()
+                window.dynamics.test_all()
+                self.matcher.check_lower_edges(smoother.point)
+                live, inflation = window.objects.live, self.uncertainty.inflation
+                converged = relinearize_window(
+                    smoother, self.matcher, max_iterations, live, self._share, inflation
+                )
+                self.uncertainty = Uncertainty.of(smoother)
+                self.findings = score_findings(smoother, self.config.calibration.assumptions)
+                if self.edges is not None:
+                    self.edges.finish(self.matcher, smoother, self.guess.cTl)
         except EstimationError as error:
             _LOG.warning("tracker: the window as a whole could not be solved: %s", error)
             return None
         self.entered.extend(set(smoother.entries) - set(self.entered))
+        self._take_over_retired(smoother)
         return converged

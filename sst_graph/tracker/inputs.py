@@ -313,7 +313,7 @@ class SensorInputs:
 
     def _forget_images(self, estimate: OnlineEstimate) -> None:
         """Drop the images that no scan, present or to come, can be paired with."""
-        margin_s = self.config.late_s + max(0.0, estimate.point.time_offset_s)
-        margin_s += 0.0 if estimate.exists else _SEARCH_MARGIN_S
+        offset_s = estimate.point.time_offset_s
+        margin_s = self.config.late_s + (0.0 if estimate.exists else _SEARCH_MARGIN_S)
         most = _MAX_EDGE_IMAGES if by_edges(self.config.calibration.classes) else _MAX_IMAGES
-        self.window.forget_images(round(1e9 * margin_s), most)
+        self.window.forget_images(round(1e9 * offset_s), round(1e9 * margin_s), most)

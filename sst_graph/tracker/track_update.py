@@ -138,13 +138,20 @@ def unconfirmed_sentences(update: TrackUpdate) -> tuple[str, ...]:
 
 
 def make_update(
-    tracker: Tracker, stamp_ns: int, reason: str = "", *, chi2: float | None = None, alarm: bool = False
+    tracker: Tracker,
+    stamp_ns: int,
+    reason: str = "",
+    *,
+    sensor: Sensor = "scan",
+    chi2: float | None = None,
+    alarm: bool = False,
 ) -> TrackUpdate:
     """The present estimate, its covariance and status, as an update.
 
     Args:
         stamp_ns: of the scan or image that was added.
         reason: why it was not accepted; empty where it was.
+        sensor: whose clock the stamp is of.
         chi2: statistic of the change test.
         alarm: it raised the alarm.
     """
@@ -152,7 +159,8 @@ def make_update(
     point, covariance = estimate.point, estimate.reported_covariance()
     confirmation, contradictions = changes.confirmation, estimate.contradictions
     # Where no scan can be used, nothing confirms the estimate either.
-    since_scan_s = tracker.inputs.window.seconds_since_scan(stamp_ns) if estimate.exists else 0.0
+    offset_ns = round(1e9 * point.time_offset_s) if sensor == "image" else 0
+    since_scan_s = tracker.inputs.window.seconds_since_scan(stamp_ns + offset_ns) if estimate.exists else 0.0
     status: TrackStatus = "alarm" if tracker.initializer.alarmed else "starting"
     weak: tuple[WeakDirection, ...] = ()
     sweep = why = ""

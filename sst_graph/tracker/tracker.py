@@ -57,7 +57,7 @@ class Tracker:
         initializer: the start that is being made.
         estimate: extrinsic, time offset and their covariance.
         monitor: whether the calibration has changed, and which one to use.
-        last_update: of the last frame given to :meth:`add`, or None.
+        last_update: of the last frame, scan or image that was given, or None.
     """
 
     def __init__(
@@ -110,42 +110,18 @@ class Tracker:
 
     def add_image(self, image: CameraImage) -> TrackUpdate:
         """Add an image; it is used as soon as a scan close to it in true time is there."""
-        update = self._use_image(image, with_update=True)
+        self.last_update = update = self._use_image(image, with_update=True)
         assert update is not None
         return update
 
-    @with_usual_errors
     def add_scan(self, scan: Scan, frame: int | None = None) -> TrackUpdate:
         """Add a scan, and estimate; where anything fails, everything is as it was.
 
         Args:
             frame: its number in the drive, by which the result names it; None: scans are counted.
         """
-        try:
-            # 1. Check the scan, its number and its stamp.
-            frame = None if frame is None else checked_index(frame)
-            checked, clock_step_ns = self.inputs.check_scan(scan)
-            with Snapshot(self):
-                # 2. Its boundary points, and the motion that led to it, go into the window.
-                jump = self.inputs.add_scan(checked, clock_step_ns, self.estimate, frame)
-                # 3. Restart where stamps jumped: earlier frames have another time offset.
-                if restart := self._restart_by_stamps(clock_step_ns, jump):
-                    return self._restart(restart, checked.stamp_ns)
-                # 4. Without an estimate: some work on the initialization.
-                if not self.estimate.exists:
-                    return self._initialize(checked.stamp_ns)
-                # 5. Match new scans, and some of the window again.
-                matches = self.estimate.match(self.inputs.window.next_scan - 1)
-                # 6. Change detection: compare new frames with the estimate before they are used.
-                chi2, change = self.monitor.check(matches, self.estimate)
-                if change is not None:
-                    return self._restart(change, checked.stamp_ns)
-                # 7. Add the matches to the graph, and estimate.
-                self.estimate.update(matches)
-                # 8. Check the start against later frames; adopt the estimate where held-out frames agree.
-                return self._review(matches, checked.stamp_ns, chi2)
-        except Exception as error:
-            return self._not_added("scan", scan, error)
+        self.last_update = update = self._use_scan(scan, frame)
+        return update
 
     @with_usual_errors
     def optimize(self, max_iterations: int = 20) -> TrackUpdate:
@@ -254,9 +230,38 @@ class Tracker:
             with Snapshot(self.inputs):
                 # 2. Its contours go into the window.
                 self.inputs.add_image(checked, clock_step_ns, self.estimate)
-                return make_update(self, checked.stamp_ns) if with_update else None
+                return make_update(self, checked.stamp_ns, sensor="image") if with_update else None
         except Exception as error:
             return self._not_added("image", image, error)
+
+    @with_usual_errors
+    def _use_scan(self, scan: Scan, frame: int | None) -> TrackUpdate:
+        """Add a scan, and estimate."""
+        try:
+            # 1. Check the scan, its number and its stamp.
+            frame = None if frame is None else checked_index(frame)
+            checked, clock_step_ns = self.inputs.check_scan(scan)
+            with Snapshot(self):
+                # 2. Its boundary points, and the motion that led to it, go into the window.
+                jump = self.inputs.add_scan(checked, clock_step_ns, self.estimate, frame)
+                # 3. Restart where stamps jumped: earlier frames have another time offset.
+                if restart := self._restart_by_stamps(clock_step_ns, jump):
+                    return self._restart(restart, checked.stamp_ns)
+                # 4. Without an estimate: some work on the initialization.
+                if not self.estimate.exists:
+                    return self._initialize(checked.stamp_ns)
+                # 5. Match new scans, and some of the window again.
+                matches = self.estimate.match(self.inputs.window.next_scan - 1)
+                # 6. Change detection: compare new frames with the estimate before they are used.
+                chi2, change = self.monitor.check(matches, self.estimate)
+                if change is not None:
+                    return self._restart(change, checked.stamp_ns)
+                # 7. Add the matches to the graph, and estimate.
+                self.estimate.update(matches)
+                # 8. Check the start against later frames; adopt the estimate where held-out frames agree.
+                return self._review(matches, checked.stamp_ns, chi2)
+        except Exception as error:
+            return self._not_added("scan", scan, error)
 
     def _add_sensors(self, frame: Frame) -> TrackUpdate:
         """Add a frame's image, then its scan."""
@@ -264,7 +269,7 @@ class Tracker:
         if frame.scan is None:
             assert of_image is not None
             return of_image
-        update = self.add_scan(frame.scan, frame.index)
+        update = self._use_scan(frame.scan, frame.index)
         if of_image is None:
             return update
         reason = "; ".join(filter(None, (of_image.reason, update.reason)))
@@ -310,16 +315,20 @@ class Tracker:
         self.monitor.begin(window.next_scan)
         return make_update(self, stamp_ns)
 
+    @property
+    def _near(self) -> StartGuess:
+        """Where the calibration is searched again: at the estimate; at the guess while there is none."""
+        point, guess = self.estimate.point, self.initializer.guess
+        return StartGuess(point.cTl, point.time_offset_s, guess.search) if self.estimate.exists else guess
+
     def _restart_by_stamps(self, clock_step_ns: int, jump: Jump | None) -> Restart | None:
         """The restart after a jump of the stamps: a clock was set, or stamps jumped against their
         interval."""
-        window, point, guess = self.inputs.window, self.estimate.point, self.initializer.guess
+        window, guess = self.inputs.window, self.initializer.guess
         if clock_step_ns:
             moved = f"the scan stamps moved by {1e-9 * clock_step_ns:+.3f} s and go on from there"
-            near = StartGuess(point.cTl, point.time_offset_s, guess.search)
-            return Restart(
-                near, len(window.scans), f"{moved}: the calibration is estimated again", alarm=True
-            )
+            why = f"{moved}: the calibration is estimated again"
+            return Restart(self._near, len(window.scans), why, alarm=self.estimate.exists)
         if jump is None:
             return None
         image, scan = jump.place
@@ -369,10 +378,10 @@ class Tracker:
                 _LOG.error("tracker: an error while a %s was added", sensor, exc_info=error)
             why = " ".join(f"{type(error).__name__}: {error}".split())[:300]
             if self.inputs.failed(why):
-                point, guess = self.estimate.point, self.initializer.guess
                 self.inputs.restart()
-                self._restart(Restart(StartGuess(point.cTl, point.time_offset_s, guess.search), 0, why), 0)
+                self._restart(Restart(self._near, 0, why), 0)
                 why = f"{why}; the calibration is estimated again"
         stamp_ns = data.stamp_ns if isinstance(data, Scan | CameraImage) else 0
         known = isinstance(stamp_ns, int | np.integer) and abs(int(stamp_ns)) <= LATEST_NS
-        return dataclasses.replace(make_update(self, int(stamp_ns) if known else 0, why), refused=(sensor,))
+        update = make_update(self, int(stamp_ns) if known else 0, why, sensor=sensor)
+        return dataclasses.replace(update, refused=(sensor,))

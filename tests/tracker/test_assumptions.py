@@ -220,7 +220,7 @@ def test_time_counts_from_the_first_image_whatever_is_kept(street: KeptDrive) ->
     for number in range(5):
         mask = np.zeros((2, 2), np.uint8)
         window.add_image(ImageFeatures(number, 1_000_000_000 + number * 100_000_000, mask, {}))
-    window.forget_images(0, 2)
+    window.forget_images(0, 0, 2)
     assert window.images[0].stamp_ns == 1_300_000_000
     assert window.drive()[0].origin_ns == 1_000_000_000
 

@@ -18,6 +18,7 @@ from sst_graph import CalibrationConfig, PinholeCamera, Tracker
 from sst_graph.batch.config import Method
 from sst_graph.errors import DataError, SstGraphError
 from sst_graph.files.object_store import stored
+from sst_graph.odometry.lidar import LidarOdometry
 from sst_graph.simulator import SimulatedDrive
 from sst_graph.types import NO_PICTURE, CameraImage, Frame, PixelStretch, Scan
 from sst_graph.validation import checked_image, checked_scan
@@ -107,6 +108,12 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+def _state(tracker: Tracker) -> tuple[Any, bytes]:
+    """All that a tracker holds, but for what it answered last."""
+    tracker.last_update = None
+    return stored(tracker)
+
+
 def _bad(rng: Rng, frames: list[Frame], count: int) -> Iterator[Frame]:
     """Frames of which the scan, the image or both have been tampered with."""
     for k in range(count):
@@ -142,21 +149,20 @@ def test_nothing_that_a_frame_brings_raises(running: Path, frames: list[Frame], 
     refused = 0
     for frame in _bad(rng, frames, 60):
         for add, data in ((tracker.add_image, frame.image), (tracker.add_scan, frame.scan)):
-            before = stored(tracker)
+            before = _state(tracker)
             update = add(data)  # type: ignore[operator]
             assert np.isfinite(update.sigmas).all() and np.isfinite(update.T_camera_lidar.matrix()).all()
             if update.refused:
                 refused += 1
                 assert update.reason and not update.accepted
-                assert stored(tracker) == before
+                assert _state(tracker) == before
     assert refused > 30
 
 
 def test_a_frame_may_be_anything(running: Path) -> None:
     """Only what was answered to it is remembered."""
     tracker = Tracker.load(running)
-    tracker.last_update = None
-    before = stored(tracker)
+    before = _state(tracker)
     for thing in (None, "frame", 3, np.zeros(3), Frame(0, None, None), Frame(0, "scan", {}), object()):
         update = tracker.add(thing)  # type: ignore[arg-type]
         assert not update.accepted and update.reason
@@ -164,19 +170,18 @@ def test_a_frame_may_be_anything(running: Path) -> None:
         update = tracker.add(Frame(index, None, None))  # type: ignore[arg-type]
         assert "frame: found an index" in update.reason
     assert tracker.last_update is not None and tracker.last_update.frame == 0
-    tracker.last_update = None
-    assert stored(tracker) == before
+    assert _state(tracker) == before
 
 
 def test_a_scan_s_number_is_one(running: Path, frames: list[Frame]) -> None:
     """Else the result could not be written, nor a checkpoint read."""
     tracker = Tracker.load(running)
-    before, scan = stored(tracker), frames[14].scan
+    before, scan = _state(tracker), frames[14].scan
     assert scan is not None
     for number in ("a", 1.5, True, np.zeros(2), 2**80, 10**5000):
         update = tracker.add_scan(scan, number)  # type: ignore[arg-type]
         assert update.refused == ("scan",) and "frame: found an index" in update.reason
-    assert stored(tracker) == before
+    assert _state(tracker) == before
     assert not tracker.add_scan(scan, np.int64(14)).refused  # type: ignore[arg-type]
 
 
@@ -338,6 +343,21 @@ def test_one_slip_of_a_clock_is_refused_and_a_clock_that_was_set_is_not(
     assert not tracker.estimate.exists and len(tracker.inputs.window.scans) == 4
 
 
+@pytest.mark.parametrize("guessed", [False, True])
+def test_a_clock_that_is_set_before_the_first_estimate_is_no_alarm(
+    street: SimulatedDrive, frames: list[Frame], guessed: bool
+) -> None:
+    """The guess stays what it was: none, where nothing was known."""
+    guess = street.nominal if guessed else None
+    tracker, day = Tracker(street.camera, initial=guess), 86_400 * 10**9
+    updates = [tracker.add_scan(_later(frame.scan, -day * (frame.index >= 3))) for frame in frames[:8]]
+    assert [bool(update.refused) for update in updates] == [False] * 3 + [True] * 4 + [False]
+    assert "scan stamps moved by -86399" in updates[-1].reason
+    assert not updates[-1].alarm and updates[-1].status == "starting"
+    assert tracker.initializer.guess.cTl is guess
+    assert (tracker.estimate.guessed_point is None) == (guess is None)
+
+
 def _later(scan: Scan | None, by_ns: int) -> Scan:
     assert scan is not None
     return dataclasses.replace(scan, stamp_ns=scan.stamp_ns + by_ns)
@@ -352,14 +372,14 @@ def test_a_scan_that_cannot_be_estimated_with_is_taken_back(running: Path, frame
     tracker, other = Tracker.load(running), Tracker.load(running)
     scan = frames[14].scan
     assert scan is not None
-    before = stored(tracker)
+    before = _state(tracker)
     for broken in _hard_to_use(scan):
         update = tracker.add_scan(broken)
         if update.refused:
-            assert stored(tracker) == before
+            assert _state(tracker) == before
         else:  # it was of use after all
             tracker = Tracker.load(running)
-            before = stored(tracker)
+            before = _state(tracker)
     for frame in frames[14:18]:
         a, b = tracker.add(frame), other.add(frame)
         assert a.T_camera_lidar.equals(b.T_camera_lidar, 0.0) and a.time_offset_s == b.time_offset_s
@@ -401,6 +421,19 @@ def test_after_ten_failures_in_a_row_the_window_is_given_up(running: Path, frame
     assert all(update.refused == ("scan",) for update in updates[:10])
     assert "estimated again" in updates[9].reason and not updates[10].refused
     assert not tracker.estimate.exists
+
+
+def test_ten_failures_before_the_first_estimate_leave_the_guess(
+    street: SimulatedDrive, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        raise ValueError("no motion")
+
+    monkeypatch.setattr(LidarOdometry, "add", fails)
+    tracker = Tracker(street.camera)
+    updates = [tracker.add_scan(frame.scan) for frame in frames[:10]]
+    assert "estimated again" in updates[-1].reason
+    assert tracker.initializer.guess.cTl is None and tracker.estimate.guessed_point is None
 
 
 def test_a_tracker_still_works_after_all_that(running: Path, frames: list[Frame]) -> None:
@@ -473,6 +506,18 @@ def test_a_frozen_sensor_is_named_and_moves_no_estimate(
     assert (np.abs(step) < lines[-1].sigmas[:6]).all()
     # A result that ends so says why.
     assert f"a frozen {'camera' if sensor == 'image' else 'LiDAR'}" in tracker.result().reasons[-1]
+
+
+def test_an_image_of_a_camera_ahead_ages_no_estimate(running: Path, frames: list[Frame]) -> None:
+    """The time since the last scan is true time, whatever the camera's clock."""
+    usual, ahead = Tracker.load(running), Tracker.load(running)
+    smoother, image = ahead.estimate.smoother, frames[14].image
+    assert smoother is not None and image is not None
+    smoother.point = dataclasses.replace(smoother.point, time_offset_s=smoother.point.time_offset_s - 2.0)
+    later = dataclasses.replace(image, stamp_ns=image.stamp_ns + 2_000_000_000)
+    a, b = usual.add_image(image), ahead.add_image(later)
+    assert b.stamp_ns == a.stamp_ns + 2_000_000_000
+    assert b.unconfirmed_s == pytest.approx(a.unconfirmed_s) and b.status == a.status
 
 
 def test_equal_frames_of_a_standing_vehicle_are_right(running: Path, frames: list[Frame]) -> None:

@@ -24,10 +24,10 @@ def _scan(k: int) -> Scan:
     return Scan(k * PERIOD_NS, points, (np.arange(24) % 2).astype(np.uint8))
 
 
-def _image(k: int) -> CameraImage:
+def _image(k: int, ahead_ns: int = 0) -> CameraImage:
     mask = np.zeros((7, 9), np.uint8)
     mask[2:5, 2 + k % 3 : 6] = 1
-    return CameraImage(k * PERIOD_NS, mask, np.zeros((7, 9, 3), np.uint8))
+    return CameraImage(k * PERIOD_NS + ahead_ns, mask, np.zeros((7, 9, 3), np.uint8))
 
 
 def _size(tracker: Tracker) -> int:
@@ -70,6 +70,17 @@ def test_images_at_any_rate_are_bounded() -> None:
         image = _image(0)
         tracker.add_image(CameraImage(k, image.mask, image.pixels))
     assert len(tracker.inputs.window.images) == _MAX_IMAGES
+
+
+@pytest.mark.parametrize("ahead_s", [-60, -6, 0, 6, 60])
+def test_scans_keep_their_images_whatever_the_camera_s_clock(ahead_s: int) -> None:
+    tracker, ahead_ns = Tracker(CAMERA, initial_time_offset_s=-ahead_s), ahead_s * 10**9
+    for k in range(100):
+        assert not tracker.add(Frame(k, _scan(k), _image(k, ahead_ns))).refused
+    window = tracker.inputs.window
+    stamps = [image.stamp_ns for image in window.images]
+    assert set(stamps) >= {scan.stamp_ns + ahead_ns for _, scan in window.scans}
+    assert len(window.scans) == 60 and len(stamps) < 60 + 30  # 2.5 s of images before the first
 
 
 def test_a_scan_meets_images_again_after_an_hour_without() -> None:

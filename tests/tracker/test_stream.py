@@ -15,6 +15,7 @@ from sst_graph.covariance.cluster_robust import robust_covariance
 from sst_graph.covariance.image_shifts import image_shifts
 from sst_graph.errors import DataError, EstimationError
 from sst_graph.factors import FactorError
+from sst_graph.files.object_store import stored
 from sst_graph.graph.building import joint_graph, state_from
 from sst_graph.graph.drive_motion import motions_of
 from sst_graph.graph.matching import associate
@@ -22,8 +23,10 @@ from sst_graph.inspect.gained import gained_of
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.result import CalibrationResult
 from sst_graph.simulator import SimulatedDrive
+from sst_graph.tracker import estimate
 from sst_graph.tracker.track_update import current_update
 from sst_graph.tracker.window.epochs import MatchedPair
+from sst_graph.tracker.window.smoother import WindowSmoother
 from sst_graph.types import Frame
 
 
@@ -96,6 +99,33 @@ def test_a_result_names_frames_by_their_numbers_in_the_drive(
     for wrong in (lambda: tracker.result(3), lambda: tracker.optimize(1.5), lambda: tracker.optimize(-1)):  # type: ignore[arg-type]
         with pytest.raises(FactorError, match=r"drive: found 3|max_iterations: found"):
             wrong()
+
+
+def test_information_is_that_of_the_scan_that_entered(street: SimulatedDrive, frames: list[Frame]) -> None:
+    """Where images come late, a scan enters with the next one."""
+    tracker = tracker_from_truth(street)
+    for frame, late in zip(frames[5:16], frames[4:], strict=False):
+        tracker.add_scan(frame.scan, frame.index)
+        tracker.add_image(late.image)
+    gained = gained_of(tracker.result("drive"))
+    assert gained is not None
+    # The first estimate comes with the eighth scan.
+    assert [gain.frame.frame for gain in gained.gains] == [11, 12, 13, 14]
+
+
+def test_what_is_told_of_the_last_data_is_theirs(running: Path, frames: list[Frame]) -> None:
+    """Whether frames are added, or scans and images alone."""
+    tracker, good = Tracker.load(running), frames[20]
+    assert good.scan is not None and good.image is not None and frames[21].image is not None
+    nothing = dataclasses.replace(good.scan, points=np.full_like(good.scan.points, np.nan))
+    refused = tracker.add(Frame(20, nothing, good.image))
+    assert refused.refused == ("scan",) and refused is tracker.last_update
+    scan = tracker.add_scan(good.scan)
+    told = current_update(tracker, tracker.last_update)
+    assert (told.stamp_ns, told.frame, told.refused) == (scan.stamp_ns, None, ())
+    assert told.accepted and told.chi2 == scan.chi2
+    image = tracker.add_image(frames[21].image)
+    assert current_update(tracker, tracker.last_update).stamp_ns == image.stamp_ns
 
 
 @pytest.mark.slow
@@ -193,6 +223,35 @@ def test_an_update_that_fails_changes_nothing(running: Path, frames: list[Frame]
         smoother.update({scan: MatchedPair(pair, entry.linear, 0, entry.image)}, set(), 0)
     assert smoother.point is before and smoother.entries == entries
     assert tracker.add(frames[20]).accepted
+
+
+def test_a_solution_of_the_window_that_fails_changes_nothing(
+    running: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where its last step does, behind the update of the graph."""
+
+    def fails(*_: object) -> None:
+        raise EstimationError("no optimum")
+
+    tracker = Tracker.load(running)
+    monkeypatch.setattr(WindowSmoother, "optimize", fails)
+    before = stored(tracker)
+    update = tracker.optimize(1)
+    assert update.converged is None and stored(tracker) == before
+
+
+def test_an_epoch_that_has_no_match_in_the_end_stays_in_the_history(
+    running: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def solved(smoother: WindowSmoother, *_: object) -> bool:
+        smoother.retired += smoother.live_epochs()
+        return True
+
+    tracker = Tracker.load(running)
+    monkeypatch.setattr(estimate, "relinearize_window", solved)
+    before = tracker.estimate.history()
+    assert tracker.optimize().converged
+    assert len(tracker.estimate.history()) == len(before) + 1
 
 
 @pytest.mark.slow

@@ -94,7 +94,7 @@ def relinearize_window(
         Whether it converged.
 
     Raises:
-        EstimationError: a step or the update fails; the estimate stays.
+        EstimationError: a step or the update fails; the smoother is to be rolled back.
     """
     at, converged = smoother.point, False
     kernels_px = NARROW_KERNELS_PX

@@ -113,7 +113,7 @@ class Window:
         return self.scans[-1][1].stamp_ns if self.scans else None
 
     def seconds_since_scan(self, stamp_ns: int) -> float:
-        """Time from the newest scan to a stamp; 0 where there is none, or for a stamp that is an error."""
+        """Time from the newest scan to a stamp of its clock; 0 where there is none, or for an error."""
         newest = self.last_stamp_ns
         later = 0 if newest is None else stamp_ns - newest
         return 1e-9 * later if 0 < later <= FARTHEST_NS else 0.0
@@ -237,17 +237,19 @@ class Window:
         if self.edges and self.labels and (features.mask != int(SemanticClass.IGNORE)).any():
             self.labelled_ns[1].add(features.stamp_ns)
 
-    def forget_images(self, margin_ns: int, most: int) -> None:
+    def forget_images(self, offset_ns: int, margin_ns: int, most: int) -> None:
         """Drop images that no scan can meet: those near the window's scans stay, and the newest ones.
 
         Args:
+            offset_ns: from the images' clock to the scans'.
             margin_ns: how far from a scan of the window, or behind the newest image, an image may lie.
             most: of all; beyond it the oldest go, whatever scan they are near. Two always stay.
         """
         if not self.images:
             return
         newest = self.images[-1].stamp_ns
-        stamps = [scan.stamp_ns for _, scan in self.scans] or [newest]
+        # By the images' clock, which may be far from the scans'.
+        stamps = [scan.stamp_ns - offset_ns for _, scan in self.scans] or [newest]
         kept = [
             image
             for image in self.images
@@ -268,6 +270,10 @@ class Window:
         while len(self.scans) > last:
             self.scans.popleft()
         self.dynamics.occupancy.forget(self.first_scan)
+
+    def frame(self, number: int) -> int:
+        """Number, in the drive, of the frame of a scan that is kept."""
+        return next(scan.index for own, scan in self.scans if own == number)
 
     def stamps_ns(self) -> dict[int, int]:
         """Stamp of each scan by its number."""
