@@ -35,7 +35,10 @@ _DATES = (
     "%Y%m%dT%H%M%S",
     "%Y%m%d_%H%M%S",
     "%Y%m%d-%H%M%S",
+    "%Y_%m_%d-%H_%M_%S",
 )
+_HYPHEN_IN_TIME = re.compile(r"(\d{4}-?\d\d-?\d\d)[-_T ](\d\d)-(\d\d)", re.ASCII)
+"""Hour and minute as file names have them; in ISO 8601 the minute would be hours west of Greenwich."""
 
 
 @dataclass(frozen=True)
@@ -301,6 +304,8 @@ def _checked_date(text: str, place: str) -> str:
 
 
 def _instant(text: str) -> datetime:
+    if plain := _HYPHEN_IN_TIME.fullmatch(text):
+        text = f"{plain[1]}T{plain[2]}:{plain[3]}"
     try:
         found = datetime.fromisoformat(text)
     except ValueError:

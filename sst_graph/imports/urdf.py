@@ -1,10 +1,14 @@
-"""Fixed joints of URDF, and of xacro files as far as their macros' defaults determine them."""
+"""Fixed joints of URDF, and of xacro files as far as their macros' defaults determine them.
+
+Nothing of xacro is run. A joint that the defaults do not determine, or that may not be there, is left out.
+"""
 
 from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections import ChainMap
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import gtsam
@@ -16,7 +20,10 @@ from sst_graph.imports.document import Document
 from sst_graph.imports.rotations import pose_by_rpy
 
 _REFERENCE = re.compile(r"\$\{\s*(\w+)\s*\}|\$\(arg (\w+)\)")
-_DEFAULT = re.compile(r"\b(\w{1,100}):=('[^']*'|\S+)")
+_DEFAULT = re.compile(r"(?<!\S)(\w{1,100}):?=('[^']*'|\S+)")
+
+_Table = dict[str, str | None]
+"""Values by name, ``arg NAME`` for an argument of the file; None for one that is not determined."""
 
 
 def is_xacro(root: ET.Element) -> bool:
@@ -27,20 +34,21 @@ def is_xacro(root: ET.Element) -> bool:
 def joints(document: Document) -> Transforms:
     """The fixed joints of a URDF or xacro file: pose of the child link in the parent link.
 
-    A joint of a xacro file whose values the defaults of parameters, properties and arguments do not determine
-    is left out.
+    A joint of a xacro file is left out where the defaults of parameters, properties and arguments do not
+    determine it: with another expression, with an element of xacro, in a condition, and in a macro that is
+    called with arguments, with a block, or in a condition.
 
     Raises:
         DataError: a fixed joint of a URDF without parent, child, or numbers.
     """
     root, found = document.xml, Transforms()
     with_xacro = is_xacro(root)
-    defaults = _defaults(root) if with_xacro else {}
-    for joint in root.iter("joint"):
+    places = _determined(root) if with_xacro else ((joint, {}) for joint in root.iter("joint"))
+    for joint, known in places:
         if joint.get("type") != "fixed":
             continue
         values = {
-            f"{element.tag}.{key}": _resolved(value, defaults)
+            f"{element.tag}.{key}": _resolved(value, known)
             for element in joint
             for key, value in element.attrib.items()
         }
@@ -68,23 +76,57 @@ def _three(text: str, place: str) -> list[float]:
     return [number(word, place) for word in words]
 
 
-def _defaults(root: ET.Element) -> dict[str, str]:
-    """Values of parameters, properties and arguments by name."""
-    found: dict[str, str] = {}
-    for element in root.iter():
+def _determined(root: ET.Element) -> Iterator[tuple[ET.Element, Mapping[str, str | None]]]:
+    """The joints that are there whatever a condition says, and the values that are known where they stand."""
+    outside: _Table = {}
+    joints: list[tuple[ET.Element, str, _Table]] = []
+    varied: set[str] = set()  # macros that are not always called as their defaults have it
+    waiting: list[tuple[ET.Element, str, _Table, bool]] = [(root, "", outside, True)]
+    while waiting:
+        element, macro, own, always = waiting.pop()
         kind = _xacro_name(element)
         if kind == "macro":
-            pairs = _DEFAULT.findall(element.get("params", ""))
-            found.update({name: value.strip("'") for name, value in pairs})
-        elif kind in ("property", "arg"):
+            macro, own = element.get("name", ""), _parameters(element.get("params", ""))
+        elif kind == "arg":
+            _take(outside, f"arg {element.get('name')}", element.get("default") if always else None)
+        elif kind == "property":
+            wider = element.get("scope") is not None
             value = element.get("value", element.get("default"))
-            if value is not None:
-                found[element.get("name", "")] = value
+            _take(outside if wider else own, element.get("name", ""), value if always and not wider else None)
+            always = False
+        elif kind:
+            arguments = dict(element.attrib)
+            called = arguments.pop("macro", "") if kind == "call" else kind
+            if not always or arguments or len(element):
+                varied.add(called)
+            always = False
+        elif element.tag == "joint" and always and not any(map(_xacro_name, element)):
+            joints.append((element, macro, own))
+        waiting += [(child, macro, own, always) for child in element[::-1]]
+    for joint, macro, own in joints:
+        if macro not in varied:
+            yield joint, ChainMap(own, outside)
+
+
+def _parameters(params: str) -> _Table:
+    """Defaults of a macro's parameters; None without one, and where the place of the call determines it."""
+    found: _Table = {word.lstrip("*"): None for word in _DEFAULT.sub(" ", params).split()}
+    for name, value in _DEFAULT.findall(params):
+        found[name] = None if value.startswith("^") else value.strip("'")
     return found
 
 
-def _resolved(text: str, defaults: Mapping[str, str]) -> str:
-    return _REFERENCE.sub(lambda match: defaults.get(match[1] or match[2], match[0]), text)
+def _take(values: _Table, name: str, value: str | None) -> None:
+    """Take a value; one of several that differ is not determined."""
+    values[name] = value if values.get(name, value) == value else None
+
+
+def _resolved(text: str, known: Mapping[str, str | None]) -> str:
+    def value(match: re.Match[str]) -> str:
+        found = known.get(match[1] or f"arg {match[2]}")
+        return match[0] if found is None else found
+
+    return _REFERENCE.sub(value, text)
 
 
 def _xacro_name(element: ET.Element) -> str:

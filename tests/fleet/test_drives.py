@@ -137,6 +137,27 @@ def test_ways_to_write_a_day(text: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    "text",
+    [
+        "2026-03-01_10-15",
+        "2026-03-01-10-15",
+        "2026-03-01T10-15",
+        "20260301_10-15",
+        "2026_03_01-10_15_00",
+        "2026-03-01_10-15-00",
+        "20260301T1015",
+        "20260301-1015",
+        "2026-03-01T04:15-06:00",
+        "2026-03-01T04:15-06",
+    ],
+)
+def test_ways_to_write_an_hour_and_a_minute(text: str, tmp_path: Path) -> None:
+    table = tmp_path / "list.csv"
+    table.write_text(f"drive,date\nx,{text}\n")
+    assert find_drives(str(table))[0].day == pytest.approx(20513.0 + 10.25 / 24.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(
     ("text", "words"),
     [
         ("", "no drive|columns"),

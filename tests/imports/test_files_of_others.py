@@ -154,6 +154,86 @@ def test_a_xacro_file_that_needs_xacro(tmp_path: Path) -> None:
         import_calibration(written(tmp_path, text.replace("-${height}", "${-height}")))
 
 
+def joint_of(child: str, origin: str, parent: str = "base") -> str:
+    ends = f'<parent link="{parent}"/><child link="{child}"/>'
+    return f'<joint name="{child}" type="fixed">{ends}{origin}</joint>'
+
+
+def macro_of(child: str, params: str, origin: str) -> str:
+    return f'<xacro:macro name="{child}" params="{params}">{joint_of(child, origin)}</xacro:macro>'
+
+
+def robot_of(*parts: str) -> str:
+    return f'<robot xmlns:xacro="http://ros.org/wiki/xacro">{"".join(parts)}</robot>'
+
+
+AT_X = '<origin xyz="${x} 0 0"/>'
+
+
+def test_each_macro_of_xacro_has_its_own_defaults(tmp_path: Path) -> None:
+    text = robot_of(
+        macro_of("lidar", "x:=1.5 y:=1", AT_X),
+        macro_of("eye", "x:=0.2", AT_X),
+        macro_of("mast", "y:=4", AT_X),
+        macro_of("open", "x", AT_X),
+        macro_of("outer", "x:=^|5", AT_X),
+        "<xacro:lidar/><xacro:eye/><xacro:mast/>",
+        '<xacro:property name="x" value="3"/><xacro:arg name="y" default="6"/>',
+        joint_of("roof", '<origin xyz="$(arg y) 0 0"/>'),
+        joint_of("wing", '<origin xyz="${y} 0 0"/>'),
+    )
+    tree = read_tree(written(tmp_path, text))
+    expected = {"lidar": 1.5, "eye": 0.2, "mast": 3.0, "roof": 6.0}
+    assert set(tree.frames) == {"base", *expected}
+    for frame, x in expected.items():
+        found = tree.pose("base", frame)[0]
+        assert found is not None and found.x() == x
+
+
+LIDAR = macro_of("lidar", "x:=1.5 *block", AT_X)
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        (LIDAR, '<xacro:lidar x="2"/>'),
+        (LIDAR, '<xacro:lidar/><xacro:lidar x="2"/>'),
+        (LIDAR, '<xacro:lidar><origin xyz="1 2 3"/></xacro:lidar>'),
+        (LIDAR, '<xacro:call macro="lidar" x="2"/>'),
+        (macro_of("lidar", "macro:=1", '<origin xyz="${macro} 0 0"/>'), '<xacro:lidar macro="2"/>'),
+        (LIDAR, '<xacro:if value="$(arg with)"><xacro:lidar/></xacro:if>'),
+        (macro_of("lidar", "*block", '<xacro:insert_block name="block"/>'),),
+        (joint_of("lidar", '<xacro:insert_block name="origin"/>'),),
+        (f'<xacro:if value="false">{joint_of("lidar", "")}</xacro:if>',),
+        (f'<xacro:unless value="true"><group>{joint_of("lidar", "")}</group></xacro:unless>',),
+        (f'<xacro:property name="part">{joint_of("lidar", "")}</xacro:property>',),
+        (
+            '<xacro:property name="x" value="1"/><xacro:property name="x" value="2"/>',
+            joint_of("lidar", AT_X),
+        ),
+        (
+            '<xacro:if value="$(arg tall)"><xacro:property name="x" value="1"/></xacro:if>',
+            joint_of("lidar", AT_X),
+        ),
+        (
+            '<xacro:macro name="m"><xacro:property name="x" value="1" scope="global"/></xacro:macro>',
+            joint_of("lidar", AT_X),
+        ),
+    ],
+)
+def test_joints_that_the_defaults_of_xacro_do_not_determine_are_left_out(
+    parts: tuple[str, ...], tmp_path: Path
+) -> None:
+    tree = read_tree(written(tmp_path, robot_of(joint_of("eye", ""), *parts)))
+    assert set(tree.frames) == {"base", "eye"}
+
+
+def test_a_macro_that_is_called_without_arguments_is_read(tmp_path: Path) -> None:
+    for calls in ("", "<xacro:lidar/>", '<xacro:call macro="lidar"/>'):
+        tree = read_tree(written(tmp_path, robot_of(macro_of("lidar", "x:=1.5", AT_X), calls)))
+        assert set(tree.frames) == {"base", "lidar"}
+
+
 BAD = {
     "": "no known format",
     "no calibration": "no known format",
