@@ -10,7 +10,7 @@ import pytest
 from scipy.sparse import csr_array
 
 from sst_graph.association.edge_matching import SIDES, TOP
-from sst_graph.covariance.cluster_robust import steps_without_objects
+from sst_graph.covariance.cluster_robust import covariance_of, steps_without_objects
 from sst_graph.covariance.error_model import (
     ErrorModel,
     fit_error_model,
@@ -75,6 +75,24 @@ def test_steps_without_objects_are_those_of_solving_again(seed: int) -> None:
         rest = table.objects != number
         again = np.linalg.solve(J[rest].T @ J[rest] + P, P @ x0 - J[rest].T @ r[rest])
         np.testing.assert_allclose(step, again, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("tight", [1e-6, 1e-3])
+def test_what_is_known_beside_the_matches_keeps_its_own_errors(tight: float) -> None:
+    """Its covariance is no matter of the matches' errors, weights and objects."""
+    table, known = random_table(3, m=60), np.zeros((8, 8))
+    known[:7, :7] = np.eye(7) / tight**2
+    bread = np.linalg.inv((table.J.T @ table.J).toarray() + known)
+    found = covariance_of(bread, table, MODELS[0], known=known)
+    np.testing.assert_allclose(np.sqrt(np.diag(found)[:7]) / tight, 1.0, rtol=1e-3)
+    without = covariance_of(np.linalg.inv((table.J.T @ table.J).toarray()), table, MODELS[0])
+    vague = covariance_of(
+        np.linalg.inv((table.J.T @ table.J).toarray() + 1e-9 * np.eye(8)),
+        table,
+        MODELS[0],
+        known=1e-9 * np.eye(8),
+    )
+    np.testing.assert_allclose(vague, without, rtol=1e-6, atol=1e-9)
 
 
 def brute_force(table: MatchTable, model: ErrorModel) -> np.ndarray:

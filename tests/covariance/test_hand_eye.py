@@ -40,8 +40,8 @@ def _covariance(noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         evaluate=lambda cTl, time_offset_s, jacobians: (noise, blocks),
         jacobians_by_camera=lambda cTl, time_offset_s: blocks,
     )
-    units = np.tile(np.eye(6), (pairs, 1, 1))
-    terms = HandEyeTerms(MotionPairs(cameras, lidars), residuals, units, np.zeros(pairs), still)
+    units, none = np.tile(np.eye(6), (pairs, 1, 1)), np.zeros((pairs, 6))
+    terms = HandEyeTerms(MotionPairs(cameras, lidars), residuals, units, np.zeros(pairs), still, none)
     H = np.einsum("nki,nkj->ij", blocks, blocks)
     found = hand_eye_covariance(terms, State(gtsam.Pose3()), H, NOTHING_SHARED)
     return found, np.linalg.inv(H)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.sparse import csr_array
@@ -50,6 +52,19 @@ def test_the_variances_are_those_drawn() -> None:
     table, H, images = drawn(2, rng.normal(size=(IMAGES, 3)) * [0.3, 0.8, 10.0])
     found = estimated(table, H, images)[1]
     np.testing.assert_allclose(found.sigmas / UNITS, [0.3, 0.8, 10.0], rtol=0.25)
+
+
+def test_robust_weights_hide_no_part_of_the_shifts() -> None:
+    """Weights that fall with the residual make a fit under them as they are fall short."""
+    rng = np.random.default_rng(11)
+    table, H, images = drawn(12, rng.normal(size=(IMAGES, 3)) * [0.3, 0.8, 0.0])
+    u = (table.r / 3.0) ** 2
+    weights, curvatures = (1.0 + u) ** -2, (1.0 - 3.0 * u) / (1.0 + u) ** 3  # Geman and McClure
+    roots = np.sqrt(weights)
+    robust = replace(table, J=csr_array(H * roots[:, None]), root_weights=roots, curvatures=curvatures)
+    assert robust.weight_curvature_ratio > 1.3
+    found = shifts_of(robust, np.eye(3), H * roots[:, None], images)
+    np.testing.assert_allclose(found.sigmas[:2], [0.3, 0.8], rtol=0.3)
 
 
 def test_nothing_is_found_where_nothing_shifts() -> None:
