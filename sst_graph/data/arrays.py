@@ -88,7 +88,7 @@ def check_stamped(times: Path, stamps: int, files: Mapping[int, Path], what: str
 def read_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Points (n, 3) float32 [m] and reflectances (n,) of a KITTI cloud: :func:`float_columns`.
 
-    Points that are NaN or inf, as drivers give for beams without a return, are left in: they have labels.
+    Beams without a return (:func:`are_returns`) are left in: they have labels.
 
     Raises:
         DataError: a missing or truncated file, one of more than MAX_POINTS points, or a coordinate that is
@@ -129,6 +129,11 @@ def _columns_of(values: NDArray[np.float32]) -> int:
         if len(alike) and (found := float(np.median(alike))) > most + _CLEARLY:
             best, most = columns, found
     return best
+
+
+def are_returns(points: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Which points (n, 3) are returns (n,): drivers give NaN, inf or the origin for beams without one."""
+    return np.asarray(np.isfinite(points).all(axis=1) & (points != 0.0).any(axis=1))
 
 
 def check_metres(points: NDArray[np.float32], path: Path) -> None:

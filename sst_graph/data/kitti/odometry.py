@@ -7,7 +7,7 @@ Below ``PATH/sequences/NN`` (or below PATH itself): ``calib.txt``, ``times.txt``
 stamps the scans alone.
 
 Some labels, masks and pictures may be missing: where nothing is labelled nothing is associated, and an image
-without its picture has no features. Points that are NaN or inf are left out and counted.
+without its picture has no features. Points that are NaN, inf or at the origin are left out and counted.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.data.arrays import read_offsets, read_points
+from sst_graph.data.arrays import are_returns, read_offsets, read_points
 from sst_graph.data.images import picture_size, read_instances
 from sst_graph.data.info.facts import SensorFacts, SourceFacts
 from sst_graph.data.kitti.calib import read_calibration
@@ -107,8 +107,7 @@ class KittiSource(IndexedSource):
         """Scan of an index that has one; errors as of the frame."""
         path = self.files.scans[index]
         points, intensities = read_points(path)
-        # Beams without a return come as NaN from many drivers.
-        used: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
+        used = are_returns(points)
         classes, instances = point_labels(self.files.labels.get(index), used, path)
         offsets_s = self._offsets(index, points, used)
         points = np.ascontiguousarray(points[used])

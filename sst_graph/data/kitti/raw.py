@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.cameras import CameraModel, Rectification
-from sst_graph.data.arrays import MAX_POINTS, check_metres, read_points
+from sst_graph.data.arrays import MAX_POINTS, are_returns, check_metres, read_points
 from sst_graph.data.images import picture_size
 from sst_graph.data.kitti.raw_calib import (
     CAM_TO_CAM,
@@ -96,7 +96,7 @@ class RawScans:
         path = self.scans[number]
         read = read_points if path.suffix.lower() == ".bin" else read_text_points
         points, intensities = read(path)
-        used: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
+        used = are_returns(points)
         classes, instances = point_labels(self.labels.get(number), used, path)
         points = np.ascontiguousarray(points[used])
         offsets_s = None if self.turn is None else self.turn.offsets_s(number, stamp_ns, points)
