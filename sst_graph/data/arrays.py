@@ -85,8 +85,8 @@ def check_stamped(times: Path, stamps: int, files: Mapping[int, Path], what: str
         raise DataError(times, found, f"{max(files) + 1}, one for each number from 0: none for {which}")
 
 
-def read_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Points (n, 3) float32 [m] and reflectances (n,) of a KITTI cloud: :func:`float_columns`.
+def read_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+    """Points (n, 3) float32 [m] and reflectances (n,), if any, of a KITTI cloud: :func:`float_columns`.
 
     Beams without a return (:func:`are_returns`) are left in: they have labels.
 
@@ -98,7 +98,7 @@ def read_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     points = np.ascontiguousarray(values[:, :3])
     check_metres(points, path)
     has_intensity = values.shape[1] > 3
-    return points, np.ascontiguousarray(values[:, 3]) if has_intensity else np.zeros(len(points), np.float32)
+    return points, np.ascontiguousarray(values[:, 3]) if has_intensity else None
 
 
 def float_columns(data: bytes, path: Path) -> NDArray[np.float32]:

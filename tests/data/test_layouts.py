@@ -22,7 +22,7 @@ from sst_graph.data import open_source
 from sst_graph.data.info import drive_info, info_text
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.errors import DataError
-from sst_graph.types import Frame, SemanticClass, Source
+from sst_graph.types import Frame, SemanticClass, Source, intensities_of
 
 
 def stamped_before(frame: Frame, seconds_ns: int) -> Frame:
@@ -91,6 +91,19 @@ def test_points_at_the_origin_are_left_out_in_every_layout(kitti_drive: Path, tm
         scan = open_source(drive, sequence="61" if drive.name == "nuscenes" else None)[2].scan
         assert scan is not None and scan.left_out == 2 and np.array_equal(scan.points, whole[kept, :3])
         assert (scan.classes == SemanticClass.VEHICLE).tolist() == [k < 3 for k in kept]
+
+
+def test_clouds_of_x_y_z_alone_have_no_intensities(kitti_drive: Path, tmp_path: Path) -> None:
+    azimuth = np.linspace(-3.1, 3.1, 240)
+    points = np.column_stack([10.0 * np.cos(azimuth), 10.0 * np.sin(azimuth), np.linspace(-1.0, 1.0, 240)])
+    for path in (kitti_drive / "velodyne").iterdir():
+        points.astype("<f4").tofile(path)
+    for path in (kitti_drive / "labels").iterdir():
+        np.full(240, 40, "<u4").tofile(path)
+    raw = as_kitti_raw(kitti_drive, tmp_path / "raw")
+    for drive in (kitti_drive, raw):
+        scan = open_source(drive)[1].scan
+        assert scan is not None and len(scan.points) == 240 and intensities_of(scan) is None
 
 
 def test_lasers_are_found_beside_points_at_the_origin(kitti_drive: Path) -> None:

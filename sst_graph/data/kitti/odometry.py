@@ -120,7 +120,7 @@ class KittiSource(IndexedSource):
             rings=rings_from_order(points),
             left_out=len(used) - len(points),
         )
-        return with_intensities(scan, intensities[used])
+        return with_intensities(scan, None if intensities is None else intensities[used])
 
     def _offsets(
         self, index: int, points: NDArray[np.float32], used: NDArray[np.bool_]

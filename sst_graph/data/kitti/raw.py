@@ -94,8 +94,8 @@ class RawScans:
             DataError: a file is damaged or holds what it must not.
         """
         path = self.scans[number]
-        read = read_points if path.suffix.lower() == ".bin" else read_text_points
-        points, intensities = read(path)
+        is_text = path.suffix.lower() != ".bin"
+        points, intensities = read_text_points(path) if is_text else read_points(path)
         used = are_returns(points)
         classes, instances = point_labels(self.labels.get(number), used, path)
         points = np.ascontiguousarray(points[used])
@@ -103,7 +103,7 @@ class RawScans:
         left_out = len(used) - len(points)
         rings = rings_from_order(points)
         scan = Scan(stamp_ns, points, classes, instances, offsets_s, rings, left_out)
-        return with_intensities(scan, intensities[used])
+        return with_intensities(scan, None if intensities is None else intensities[used])
 
 
 def read_text_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
