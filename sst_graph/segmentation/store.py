@@ -144,7 +144,7 @@ class LabelStore:
         return ImageLabels(mask, read_instances(numbered, size) if numbered.exists() else None)
 
     def put_image(self, model: str, image: CameraImage, labels: ImageLabels) -> None:
-        """Store the labels of a picture, but for instances of what has no number in Cityscapes, such as OTHER.
+        """Store the labels of a picture, but for instances of what has none in Cityscapes, such as OTHER.
 
         Raises:
             DataError: an instance number above 255, or a class that cannot be stored.
