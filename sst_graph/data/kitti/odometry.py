@@ -73,7 +73,7 @@ class KittiSource(IndexedSource):
         index = self._index(position)
         scan, image = self._scan(index), self._image(index)
         if image is not None:
-            image = replace(image, instances=self._instances(index))
+            image = replace(image, instances=self.instances(index))
         return Frame(index, scan, image)
 
     def read_scan(self, position: int) -> Scan | None:
@@ -138,7 +138,8 @@ class KittiSource(IndexedSource):
             return None
         return self.pictures.image(number, int(self.stamps_ns[index]))
 
-    def _instances(self, index: int) -> NDArray[np.uint16] | None:
+    def instances(self, index: int) -> NDArray[np.uint16] | None:
+        """Instances (h, w) of the image of an index, or None; errors as of the frame."""
         path = self.files.instances.get(index + self.options.image_shift)
         return None if path is None else read_instances(path, (self.camera.width, self.camera.height))
 
@@ -196,9 +197,13 @@ def _with_image_stamps(
     def image(k: int) -> CameraImage:
         return pictures.image(int(images[k]), int(image_stamps_ns[images[k]]))
 
+    def instances(k: int) -> NDArray[np.uint16] | None:
+        return source.instances(int(images[k]))
+
     files, missing = source.files, source.files.missing()
     of_scans = Sensor(source.stamps_ns[scans], scan, _folder(files.scans))
-    of_images = Sensor(image_stamps_ns[images], image, _folder(files.images or files.masks))
+    place = _folder(files.images or files.masks)
+    of_images = Sensor(image_stamps_ns[images], image, place, instances=instances)
     properties = replace(source.properties, notes=(missing,) if missing else ())
     return merged(properties, of_scans, of_images, options, folder, scans_are_complete=True)
 
