@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.data.arrays import MAX_POINTS, are_returns
-from sst_graph.data.point_files.cloud import INTENSITIES, RINGS, TIMES
+from sst_graph.data.point_files.cloud import INTENSITIES, RINGS, TIMES, is_constant
 from sst_graph.data.point_times import FARTHEST_S, WITHOUT_TIMES, PointClock, seconds_after_stamp
 from sst_graph.errors import DataError, count_of
 from sst_graph.validation import FARTHEST_M
@@ -147,11 +147,12 @@ def _names(table: NDArray[Any]) -> tuple[str, ...]:
 
 
 def _rings(table: NDArray[Any]) -> NDArray[np.uint16] | None:
-    """Laser numbers; floats are taken where they hold such."""
+    """Laser numbers, if there are several; floats are taken where they hold such."""
     for name in RINGS:
         values = table[name] if name in _names(table) else None
         if values is not None and (values == values.astype(np.uint16)).all():
-            return values.astype(np.uint16)
+            rings = values.astype(np.uint16)
+            return None if is_constant(rings) else rings
     return None
 
 
