@@ -93,6 +93,8 @@ def test_numpy_files(tmp_path: Path) -> None:
         np.savez(tmp_path / "b.npz", **{name: points}, ring=values["ring"])
         np.testing.assert_array_equal(read_cloud(tmp_path / "b.npz").rings(), values["ring"])
         np.testing.assert_array_equal(read_cloud(tmp_path / "b.npz").points(), points[:, :3])
+    np.savez(tmp_path / "b.npz", points=points, stamp=np.int64(5), frame=np.array("lidar"))
+    np.testing.assert_array_equal(read_cloud(tmp_path / "b.npz").points(), points[:, :3])
     xyz = {axis: values[axis] for axis in "xyz"}
     np.savez(tmp_path / "b.npz", **xyz, normals=np.ones((len(points), 3)))
     np.testing.assert_array_equal(read_cloud(tmp_path / "b.npz").points(), points[:, :3])
