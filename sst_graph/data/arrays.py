@@ -85,10 +85,10 @@ def check_stamped(times: Path, stamps: int, files: Mapping[int, Path], what: str
         raise DataError(times, found, f"{max(files) + 1}, one for each number from 0: none for {which}")
 
 
-def read_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Points (n, 3) float32 [m] and reflectances (n,) of a KITTI cloud: :func:`float_columns`.
+def read_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+    """Points (n, 3) float32 [m] and reflectances (n,), if any, of a KITTI cloud: :func:`float_columns`.
 
-    Points that are NaN or inf, as drivers give for beams without a return, are left in: they have labels.
+    Beams without a return (:func:`are_returns`) are left in: they have labels.
 
     Raises:
         DataError: a missing or truncated file, one of more than MAX_POINTS points, or a coordinate that is
@@ -98,7 +98,7 @@ def read_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     points = np.ascontiguousarray(values[:, :3])
     check_metres(points, path)
     has_intensity = values.shape[1] > 3
-    return points, np.ascontiguousarray(values[:, 3]) if has_intensity else np.zeros(len(points), np.float32)
+    return points, np.ascontiguousarray(values[:, 3]) if has_intensity else None
 
 
 def float_columns(data: bytes, path: Path) -> NDArray[np.float32]:
@@ -129,6 +129,11 @@ def _columns_of(values: NDArray[np.float32]) -> int:
         if len(alike) and (found := float(np.median(alike))) > most + _CLEARLY:
             best, most = columns, found
     return best
+
+
+def are_returns(points: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Which points (n, 3) are returns (n,): drivers give NaN, inf or the origin for beams without one."""
+    return np.asarray(np.isfinite(points).all(axis=1) & (points != 0.0).any(axis=1))
 
 
 def check_metres(points: NDArray[np.float32], path: Path) -> None:

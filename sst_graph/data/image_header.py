@@ -11,6 +11,9 @@ import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sst_graph.data.length_header import bmp_or_webp_size, check_declared_length, is_bmp_or_webp
 from sst_graph.errors import DataError, count_of
 
@@ -19,6 +22,8 @@ JPEG = b"\xff\xd8\xff"
 TIFF = (b"II*\0", b"MM\0*")
 
 _START_OF_FRAME = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF}
+_COLOUR_TYPE, _OF_PALETTE = 25, 3
+"""Where the header of a PNG file says what its pixels are, and that of indices."""
 _STANDALONE = {0x01, *range(0xD0, 0xD8)}
 _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
 
@@ -59,6 +64,17 @@ def check_whole(data: bytes, path: str | Path) -> None:
         check_declared_length(data, path)
     else:
         _check_jpeg_end(data, path)
+
+
+def palette_of(data: bytes) -> NDArray[np.uint8] | None:
+    """Colours (n, 3) by index of a whole PNG file of indices; None of another one."""
+    if not data.startswith(PNG) or data[_COLOUR_TYPE] != _OF_PALETTE:
+        return None
+    at, kind, length = len(PNG), b"", 0
+    while kind not in (b"PLTE", b"IEND"):
+        at += length and length + 12
+        length, kind = int.from_bytes(data[at : at + 4], "big"), data[at + 4 : at + 8]
+    return np.frombuffer(data, np.uint8, length // 3 * 3, at + 8).reshape(-1, 3)
 
 
 def _png_size(data: bytes, path: str | Path) -> tuple[int, int]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.data.decoder_output import decoder_output
-from sst_graph.data.image_header import JPEG, check_whole, image_size
+from sst_graph.data.image_header import JPEG, check_whole, image_size, palette_of
 from sst_graph.errors import DataError
 from sst_graph.files.reading import FileKind, read_file
 
@@ -29,7 +29,6 @@ DARK = 16
 Size = tuple[int, int]
 """Width, height [px]."""
 
-_PNG, _COLOUR_TYPE, _OF_PALETTE = b"\x89PNG", 25, b"\x03"
 _PADDING = "extraneous bytes before marker 0xd9"
 """What libjpeg says of padding before the end, as some cameras write it: no pixel is missing."""
 
@@ -123,13 +122,23 @@ def _one_channel(image: NDArray[Any], data: bytes, place: str | Path) -> NDArray
         raise DataError(place, "a JPEG picture, whose numbers are not exact", "a mask as PNG")
     if image.ndim == 3:
         channels = image[:, :, :3]
-        if (channels != channels[:, :, :1]).any():
+        has_colours, palette = bool((channels != channels[:, :, :1]).any()), palette_of(data)
+        if has_colours or not (palette is None or _are_indices(palette)):
             found = f"{image.shape[2]} channels that differ"
-            if data.startswith(_PNG) and data[_COLOUR_TYPE : _COLOUR_TYPE + 1] == _OF_PALETTE:
-                found = "a palette of colours"
+            if palette is not None:
+                found = (
+                    "a palette of colours" if has_colours else "a palette of greys other than their indices"
+                )
             raise DataError(place, found, "one channel of class numbers, without colours")
         image = channels[:, :, 0]
     return np.ascontiguousarray(image)
+
+
+def _are_indices(palette: NDArray[np.uint8]) -> bool:
+    """Whether a palette (n, 3) gives each index as its grey, so that it does not matter which one is meant;
+    behind its last entry tools write black."""
+    used = palette[: int(np.flatnonzero(palette.any(axis=1)).max(initial=0)) + 1]
+    return bool((used == np.arange(len(used))[:, None]).all())
 
 
 def _decoded(data: bytes, flags: int, path: str | Path, size: Size | None) -> NDArray[Any]:

@@ -74,10 +74,20 @@ class TimingFromCloud(SweepTiming):
 
 
 def in_lidar_axes(scan: Scan, T_cloud_lidar: gtsam.Pose3) -> Scan:
-    """A scan moved to the LiDAR's axes. Lasers that its order shows are seen from there."""
+    """A scan moved to the LiDAR's axes. Lasers by its order are seen from there; recorded ones stay."""
     points = _moved(scan.points, T_cloud_lidar)
+    rings = scan.rings
+    # Readers number the lasers by the order of the points where the data do not.
+    if rings is None or _is_by_order(rings, scan.points):
+        by_order = rings_from_order(points)
+        rings = rings if by_order is None else by_order
+    return replace(scan, points=points, rings=rings)
+
+
+def _is_by_order(rings: NDArray[np.uint16], points: NDArray[np.float32]) -> bool:
+    """Whether rings (n,) are those that the order of the points (n, 3) shows from where these are."""
     by_order = rings_from_order(points)
-    return replace(scan, points=points, rings=scan.rings if by_order is None else by_order)
+    return by_order is not None and np.array_equal(rings, by_order)
 
 
 class LidarFrameSource(ChangedSource):

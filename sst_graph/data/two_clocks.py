@@ -35,12 +35,14 @@ class Sensor(Generic[T]):
         read: measurement k of n, stamped ``stamps_ns[k]``; DataError where its files cannot be used.
         place: where its data stand: a topic, a folder.
         topic: name of the topic; empty where it is none.
+        instances: of images: instances (h, w) of image k, which whole frames show; None: there are none.
     """
 
     stamps_ns: NDArray[np.int64]
     read: Callable[[int], T]
     place: str = ""
     topic: str = ""
+    instances: Callable[[int], NDArray[np.uint16] | None] | None = None
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -195,7 +197,10 @@ class TwoClockSource(IndexedSource):
         return [k for k, index in enumerate(self.indices) if self.places[index].image is not None]
 
     def _frame(self, position: int) -> Frame:
-        return Frame(self._index(position), self.read_scan(position), self.read_image(position))
+        image, of_image = self.read_image(position), self.places[self._index(position)].image
+        if image is not None and of_image is not None and self.images.instances is not None:
+            image = replace(image, instances=self.images.instances(of_image))
+        return Frame(self._index(position), self.read_scan(position), image)
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -235,7 +240,7 @@ class TwoClockSource(IndexedSource):
         return None if place.scan is None else self.scans.read(place.scan)
 
     def read_image(self, position: int) -> CameraImage | None:
-        """Image of the frame at a position; errors as of the frame."""
+        """Image of the frame at a position, without instances; errors as of the frame."""
         place = self.places[self._index(position)]
         return None if place.image is None else self.images.read(place.image)
 
@@ -318,7 +323,9 @@ def _shifted(images: Sensor[CameraImage], shift: int) -> tuple[Sensor[CameraImag
     stamps = images.stamps_ns[first : first + count]
     real = images.stamps_ns[first + shift : first + shift + count]
     shifted = _Shifted(images, first + shift, stamps)
-    return Sensor(stamps, shifted.read, images.place, images.topic), float(np.mean(real - stamps)) * 1e-9
+    instances = None if images.instances is None else shifted.instances
+    sensor = Sensor(stamps, shifted.read, images.place, images.topic, instances)
+    return sensor, float(np.mean(real - stamps)) * 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,6 +338,9 @@ class _Shifted:
 
     def read(self, k: int) -> CameraImage:
         return replace(self.images.read(self.first + k), stamp_ns=int(self.stamps_ns[k]))
+
+    def instances(self, k: int) -> NDArray[np.uint16] | None:
+        return None if self.images.instances is None else self.images.instances(self.first + k)
 
 
 def _selected(places: tuple[FramePositions, ...], options: SourceOptions) -> tuple[int, ...]:

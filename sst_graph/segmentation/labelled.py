@@ -108,7 +108,8 @@ class Labelling:
         _check_shape(labels.mask.shape, image.pixels.shape[:2], f"{segmenter.name}: {place}")
         self.store.put_image(model.identity, image, labels)
         self.counts["made"] += 1
-        return labels
+        # As every later run finds them.
+        return self.store.image(model.identity, image) or labels
 
     def _labels_of_scan(self, model: StoredModel, scan: Scan) -> PointLabels:
         segmenter, place = self.scan_segmenter, f"the scan stamped {scan.stamp_ns} ns"
@@ -121,7 +122,7 @@ class Labelling:
         _check_shape(labels.classes.shape, (len(scan.points),), f"{segmenter.name}: {place}")
         self.store.put_scan(model.identity, scan, labels)
         self.counts["made"] += 1
-        return labels
+        return self.store.scan(model.identity, scan) or labels
 
     def _stored(self, read: Callable[[], T | None], can_be_made: bool) -> T | None:
         """What is stored; what is damaged is made again where that is possible."""

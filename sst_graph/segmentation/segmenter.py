@@ -17,7 +17,7 @@ class ImageLabels(ByValue):
 
     Attributes:
         mask: (h, w) uint8 of :class:`~sst_graph.types.SemanticClass`.
-        instances: (h, w) uint16 instance number (0: none), or None.
+        instances: (h, w) uint16 instance number within its class, at most 255 (0: none), or None.
     """
 
     mask: NDArray[np.uint8]

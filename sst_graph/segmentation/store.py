@@ -48,6 +48,8 @@ VERSION = 1
 _MODEL_FILE = "model.json"
 _MODEL = FileKind("the model.json of stored labels", 64 * 1024)
 _INSTANCES = ".instances.png"
+_MOST_INSTANCES = 255
+"""Of a class, by 8 bits of a number."""
 _DIGITS = 16
 """Of a network's identity in the name of its folder: 2^-32 for a collision among 65,000 networks."""
 
@@ -142,10 +144,20 @@ class LabelStore:
         return ImageLabels(mask, read_instances(numbered, size) if numbered.exists() else None)
 
     def put_image(self, model: str, image: CameraImage, labels: ImageLabels) -> None:
-        """Store the labels of a picture."""
+        """Store the labels of a picture, but for instances of what has none in Cityscapes, such as OTHER.
+
+        Raises:
+            DataError: an instance number above 255, or a class that cannot be stored.
+        """
         path = self._image_path(model, image)
         ids = cityscapes_ids_of(labels.mask)
         if labels.instances is not None:
+            if (most := int(labels.instances.max(initial=0))) > _MOST_INSTANCES:
+                place, expected = (
+                    f"the image stamped {image.stamp_ns} ns",
+                    f"at most {_MOST_INSTANCES} a class",
+                )
+                raise DataError(place, f"instance {most}", expected)
             numbered = np.where(labels.instances > 0, ids.astype(np.uint16) * 256 + labels.instances, 0)
             # Before the mask: where that is found, nothing is missing.
             atomic_write_bytes(_instances_path(path), _png(numbered.astype(np.uint16)))
@@ -167,7 +179,7 @@ class LabelStore:
         return PointLabels(classes, instances if instances.any() else None)
 
     def put_scan(self, model: str, scan: Scan, labels: PointLabels) -> None:
-        """Store the labels of a scan."""
+        """Store the labels of a scan; SKY becomes OTHER."""
         numbers = semantic_kitti_of(labels.classes, labels.instances)
         atomic_write_bytes(self._scan_path(model, scan), numbers.astype("<u4").tobytes())
 

@@ -226,6 +226,8 @@ CAMERAS = {
     "script": "resolution: [8, 6]\nmtx: [[700, 0, 4], [0, 701, 3], [0, 0, 1]]\ndist_coeffs: [0, 0, 0, 0]\n",
     "camera_info": "header: {frame_id: camera}\nheight: 6\nwidth: 8\ndistortion_model: plumb_bob\n"
     "d: [0, 0, 0, 0]\nk: [700, 0, 4, 0, 701, 3, 0, 0, 1]\nbinning_x: 0\nroi: {width: 0}\n---\n",
+    "camera_info of all the sensor": "height: 6\nwidth: 8\ndistortion_model: plumb_bob\nd: [0, 0, 0, 0]\n"
+    "k: [700, 0, 4, 0, 701, 3, 0, 0, 1]\nroi: {x_offset: 0, y_offset: 0, height: 6, width: 8}\n",
     "plain": "fx: 700\nfy: 7.01e2\ncx: 4\ncy: 3\nwidth: 8\nheight: 6\n",
 }
 
@@ -303,6 +305,7 @@ CHAIN = "intrinsics: [700, 701, 4, 3]\nresolution: [8, 6]\n"
         (f"{CHAIN}distortion_model: radtan\n", "the distortion 'radtan' without coefficients"),
         (f"{CHAIN}distortion_model: [radtan]\n", "the distortion '.*radtan.*' without coefficients"),
         (f"{K}binning_x: 2\n", "binning"),
+        (f"{K}roi: {{x_offset: 0, y_offset: 0, height: 3, width: 8}}\n", "region of interest"),
         (f"{K}binning_x: x\n", "binning_x: 'x', expected a whole number"),
         (f"{K}binning_x: .nan\n", "binning_x: nan, expected a whole number"),
         (f"{K}roi: {{x_offset: null}}\n", "x_offset: None, expected a whole number"),

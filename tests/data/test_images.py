@@ -163,7 +163,7 @@ def test_a_process_without_stderr_reads_pictures_too(tmp_path: Path) -> None:
 
 
 def test_a_palette_of_colours_is_named(tmp_path: Path) -> None:
-    """As segmentation tools write masks for the eye; a palette of grey values is read as these."""
+    """As segmentation tools write masks for the eye. Of greys the indices may be meant, or the greys."""
     mask = Image.fromarray(np.array([[0, 1], [2, 1]], np.uint8), "P")
     mask.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0])
     mask.save(tmp_path / "mask.png")
@@ -171,7 +171,12 @@ def test_a_palette_of_colours_is_named(tmp_path: Path) -> None:
         read_mask(tmp_path / "mask.png")
     mask.putpalette([7, 7, 7, 8, 8, 8, 9, 9, 9])
     mask.save(tmp_path / "grey.png")
-    np.testing.assert_array_equal(read_mask(tmp_path / "grey.png"), [[7, 8], [9, 8]])
+    with pytest.raises(DataError, match=r"grey\.png: found a palette of greys other than their indices"):
+        read_mask(tmp_path / "grey.png")
+    for entries in (3, 256):
+        mask.putpalette(np.repeat(np.arange(entries), 3).tolist())
+        mask.save(tmp_path / "same.png")
+        np.testing.assert_array_equal(read_mask(tmp_path / "same.png"), [[0, 1], [2, 1]])
 
 
 FORKS = """

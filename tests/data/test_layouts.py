@@ -22,7 +22,7 @@ from sst_graph.data import open_source
 from sst_graph.data.info import drive_info, info_text
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.errors import DataError
-from sst_graph.types import Frame, Source
+from sst_graph.types import Frame, SemanticClass, Source, intensities_of
 
 
 def stamped_before(frame: Frame, seconds_ns: int) -> Frame:
@@ -71,6 +71,52 @@ def test_every_layout_says_where_its_start_comes_from(kitti_drive: Path, tmp_pat
     (folder / "extrinsic.yaml").unlink()
     info = drive_info(open_source(folder))
     assert not info.nominal and info.nominal_reason == "no extrinsic.yaml"
+
+
+def test_points_at_the_origin_are_left_out_in_every_layout(kitti_drive: Path, tmp_path: Path) -> None:
+    """With their labels; drivers give NaN or the origin for beams without a return."""
+    path = kitti_drive / "velodyne/000002.bin"
+    whole = np.fromfile(path, "<f4").reshape(-1, 4)
+    values = whole.copy()
+    values[1, :3], values[7, 1] = 0.0, np.nan
+    values.tofile(path)
+    kept = np.delete(np.arange(len(values)), [1, 7])
+    for drive in (
+        kitti_drive,
+        as_kitti_raw(kitti_drive, tmp_path / "raw"),
+        as_folder(kitti_drive, tmp_path / "bin"),
+        as_folder(kitti_drive, tmp_path / "npz", ".npz"),
+        as_nuscenes(kitti_drive, tmp_path / "nuscenes"),
+    ):
+        scan = open_source(drive, sequence="61" if drive.name == "nuscenes" else None)[2].scan
+        assert scan is not None and scan.left_out == 2 and np.array_equal(scan.points, whole[kept, :3])
+        assert (scan.classes == SemanticClass.VEHICLE).tolist() == [k < 3 for k in kept]
+
+
+def test_clouds_of_x_y_z_alone_have_no_intensities(kitti_drive: Path, tmp_path: Path) -> None:
+    azimuth = np.linspace(-3.1, 3.1, 240)
+    points = np.column_stack([10.0 * np.cos(azimuth), 10.0 * np.sin(azimuth), np.linspace(-1.0, 1.0, 240)])
+    for path in (kitti_drive / "velodyne").iterdir():
+        points.astype("<f4").tofile(path)
+    for path in (kitti_drive / "labels").iterdir():
+        np.full(240, 40, "<u4").tofile(path)
+    raw = as_kitti_raw(kitti_drive, tmp_path / "raw")
+    for drive in (kitti_drive, raw):
+        scan = open_source(drive)[1].scan
+        assert scan is not None and len(scan.points) == 240 and intensities_of(scan) is None
+
+
+def test_lasers_are_found_beside_points_at_the_origin(kitti_drive: Path) -> None:
+    azimuth, elevation = np.meshgrid(np.linspace(-3.1, 3.1, 60), np.radians([-2.0, -5.0, -9.0, -14.0]))
+    directions = [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
+    points = 10.0 * np.stack(directions, -1).reshape(-1, 3)
+    points[::7] = 0.0
+    values = np.column_stack([points, np.ones(len(points))]).astype("<f4")
+    values.tofile(kitti_drive / "velodyne/000002.bin")
+    (kitti_drive / "labels/000002.label").unlink()
+    scan = open_source(kitti_drive)[2].scan
+    lasers = np.repeat(np.arange(4), 60)[(points != 0.0).any(axis=1)]
+    assert scan is not None and scan.rings is not None and np.array_equal(scan.rings, lasers)
 
 
 def test_files_that_macos_leaves_are_no_frames(kitti_drive: Path, tmp_path: Path) -> None:

@@ -15,9 +15,11 @@ from sst_graph import open_source
 from sst_graph.data.lidar_pose import (
     LidarFrameSource,
     TimingFromCloud,
+    in_lidar_axes,
     lidar_pose_text,
     parse_lidar_pose,
 )
+from sst_graph.data.scan_order import rings_from_order
 from sst_graph.data.source_view import ChangedSource
 from sst_graph.diagnosis.lasers import other_axes
 from sst_graph.drive.input_statistics import StatisticsCollector
@@ -94,6 +96,21 @@ def test_the_drive_is_as_in_the_axes_of_the_lidar() -> None:
     assert (in_vehicle.nominal or gtsam.Pose3()).equals(drive.nominal * pose, 1e-9)
     assert (given * pose).equals(drive.nominal, 1e-9)
     assert drive.truth is not None and seen.truth.cTl.equals(drive.truth.cTl * pose, 1e-9)
+
+
+def test_lasers_that_the_data_number_keep_their_numbers() -> None:
+    """A driver that counts from below, and whose upper lasers have no return in this scan."""
+    azimuth, elevation = np.meshgrid(np.linspace(-3.1, 3.1, 200), np.radians([-2.0, -5.0, -9.0, -14.0]))
+    directions = [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
+    points = (10.0 * np.stack(directions, -1)).reshape(-1, 3).astype(np.float32)
+    lasers = np.repeat(np.array([5, 4, 3, 2], np.uint16), 200)
+    pose = parse_lidar_pose("0.5,0,1")
+    in_vehicle = points + pose.translation().astype(np.float32)
+    scan = Scan(0, in_vehicle, np.zeros(len(points), np.uint8), rings=lasers)
+    moved = in_lidar_axes(scan, pose)
+    assert moved.rings is not None and np.array_equal(moved.rings, lasers)
+    unnumbered = in_lidar_axes(replace(scan, rings=rings_from_order(in_vehicle)), pose)
+    assert unnumbered.rings is not None and np.array_equal(unnumbered.rings, np.repeat(np.arange(4), 200))
 
 
 def test_every_loader_takes_the_pose() -> None:

@@ -15,6 +15,7 @@ from checks.fuzz_layouts import HEADERS, npy_of
 from sst_graph.data.arrays import read_points
 from sst_graph.data.point_files import read_cloud
 from sst_graph.data.point_files.pcd import unpack_lzf
+from sst_graph.data.point_times import seconds_after_stamp
 from sst_graph.errors import DataError
 
 DTYPE = np.dtype(
@@ -92,6 +93,8 @@ def test_numpy_files(tmp_path: Path) -> None:
         np.savez(tmp_path / "b.npz", **{name: points}, ring=values["ring"])
         np.testing.assert_array_equal(read_cloud(tmp_path / "b.npz").rings(), values["ring"])
         np.testing.assert_array_equal(read_cloud(tmp_path / "b.npz").points(), points[:, :3])
+    np.savez(tmp_path / "b.npz", points=points, stamp=np.int64(5), frame=np.array("lidar"))
+    np.testing.assert_array_equal(read_cloud(tmp_path / "b.npz").points(), points[:, :3])
     xyz = {axis: values[axis] for axis in "xyz"}
     np.savez(tmp_path / "b.npz", **xyz, normals=np.ones((len(points), 3)))
     np.testing.assert_array_equal(read_cloud(tmp_path / "b.npz").points(), points[:, :3])
@@ -154,6 +157,19 @@ def test_times_count_in_any_unit_absolute_or_relative(tmp_path: Path) -> None:
     assert read_cloud(tmp_path / "a.npz").offsets_s(stamp_ns, np.array([True, False, False])) is not None
 
 
+@pytest.mark.parametrize(
+    ("stamp_s", "after_s"),
+    [*((stamp_s, s) for stamp_s in (0.0, 0.05, 0.1, 0.3, 0.85, 1.5) for s in (0.0, 0.001)), (0.3, -0.1)],
+)
+def test_times_in_the_first_second_of_a_clock(stamp_s: float, after_s: float) -> None:
+    """Of a simulation, say; of stamps of the ends the first sweep shows nothing."""
+    offsets, stamp_ns = np.linspace(after_s, 0.0998 + min(after_s, 0.0), 50), round(stamp_s * 1e9)
+    for values in (offsets, stamp_s + offsets):
+        found = seconds_after_stamp(values, stamp_ns)
+        assert found is not None
+        np.testing.assert_allclose(found, offsets, atol=1e-9)
+
+
 def test_times_that_are_all_0_are_none(tmp_path: Path) -> None:
     """Drivers leave the field unfilled; a point that is left out may have any time."""
     xyz = {name: np.zeros(3) for name in "xyz"}
@@ -187,7 +203,10 @@ def test_a_bin_says_how_many_values_a_point_has(tmp_path: Path, extra: int, orde
     np.testing.assert_array_equal(read_cloud(tmp_path / "a.bin").points(), rows[:, :3])
     points, intensities = read_points(tmp_path / "a.bin")
     np.testing.assert_array_equal(points, rows[:, :3])
-    np.testing.assert_array_equal(intensities, rows[:, 3] if extra >= 0 else np.zeros(len(rows)))
+    if extra < 0:
+        assert intensities is None
+    else:
+        np.testing.assert_array_equal(intensities, rows[:, 3])
 
 
 # --- broken files -----------------------------------------------------------------------------------------

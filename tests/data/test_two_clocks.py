@@ -6,6 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import cast
 
+import cv2
 import gtsam
 import numpy as np
 import pytest
@@ -149,6 +150,17 @@ def test_kitti_odometry_with_image_stamps_of_its_own(kitti_drive: Path) -> None:
     (kitti_drive / "times_2.txt").write_text("0.1\n0.2\n")
     with pytest.raises(DataError, match=r"times_2\.txt: found 2 stamps for 5 images, expected 5"):
         open_source(kitti_drive)
+
+
+def test_kitti_odometry_with_image_stamps_of_its_own_and_instances(kitti_drive: Path) -> None:
+    (kitti_drive / "times_2.txt").write_text("".join(f"{t}\n" for t in (0.05, 0.15, 0.2, 0.36, 0.46)))
+    (kitti_drive / "instance_2").mkdir()
+    for k in range(5):
+        cv2.imwrite(str(kitti_drive / f"instance_2/{k:06d}.png"), np.full((6, 8), 26 * 256 + k, np.uint16))
+    for shift in (0, 1):
+        images = [frame.image for frame in open_source(kitti_drive, image_shift=shift)]
+        numbers = [(image.instances == k).all() for k, image in enumerate(filter(None, images), shift)]
+        assert numbers == [True] * (5 - shift)
 
 
 # --- calibration ------------------------------------------------------------------------------------------

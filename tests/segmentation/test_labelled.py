@@ -24,6 +24,7 @@ from sst_graph.segmentation import (
     ImageLabels,
     LabelledSource,
     LabelStore,
+    PointLabels,
     cache_folder,
     open_image_segmenter,
     open_scan_segmenter,
@@ -210,6 +211,35 @@ def test_labels_of_another_shape_are_refused(tmp_path: Path) -> None:
 
     with pytest.raises(DataError, match=r"labels of shape \(3, 4\), expected \(6, 8\)"):
         with_labels(drive_of(), Small(1), None, tmp_path)[0]
+
+
+def test_labels_are_the_same_when_they_are_made_and_when_they_are_found(tmp_path: Path) -> None:
+    """Cityscapes numbers no instances of OTHER; SemanticKITTI has no SKY."""
+
+    class Everything(Threshold):
+        def segment(self, image: CameraImage) -> ImageLabels:
+            mask = np.random.default_rng(3).choice(CLASSES, (6, 8))
+            return ImageLabels(mask, np.full((6, 8), 255, np.uint16))
+
+    class Sky(Threshold):
+        def segment(self, scan: Scan) -> PointLabels:  # type: ignore[override]
+            return PointLabels(np.full(len(scan.points), SemanticClass.SKY, np.uint8))
+
+    made, found = (with_labels(drive_of(1), Everything(1), Sky(1), tmp_path)[0] for _ in range(2))  # type: ignore[arg-type]
+    assert made == found and made.image is not None and made.image.instances is not None
+
+
+def test_instances_that_cannot_be_stored_are_refused(tmp_path: Path) -> None:
+    class Many(Threshold):
+        def segment(self, image: CameraImage) -> ImageLabels:
+            return ImageLabels(
+                np.full((6, 8), SemanticClass.VEHICLE, np.uint8), np.full((6, 8), 300, np.uint16)
+            )
+
+    with pytest.raises(
+        DataError, match="image stamped 0 ns: found instance 300, expected at most 255 a class"
+    ):
+        with_labels(drive_of(), Many(1), None, tmp_path)[0]
 
 
 def test_the_cache_is_the_users(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

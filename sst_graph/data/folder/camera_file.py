@@ -88,10 +88,11 @@ def read_camera(path: Path, name: str = "") -> CameraModel:
         return cameras_from_kalibr({key: {"camera_model": "pinhole", **own}}, path)[key].model
     if any(plain_key(key) in _OPENCV["camera_matrix"] for key in table):
         calibration = _by_opencv_names(table, path)
-        check_full_sensor(calibration, path)
-        return camera_from_opencv({"distortion_coefficients": [], **calibration}, path)
-    if (camera := slam_camera(table, path)) is not None:
+        camera = camera_from_opencv({"distortion_coefficients": [], **calibration}, path)
+        check_full_sensor({**calibration, "width": camera.width, "height": camera.height}, path)
         return camera
+    if (of_slam := slam_camera(table, path)) is not None:
+        return of_slam
     raise DataError(path, f"keys {', '.join(map(str, table))}"[:200], _EXPECTED)
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sst_graph.cameras import Rectification
 from sst_graph.classes import classes_of_points
-from sst_graph.data.arrays import listed
+from sst_graph.data.arrays import are_returns, listed
 from sst_graph.data.folder.camera_file import read_camera, read_extrinsic
 from sst_graph.data.folder.stamps import StampedFiles, stamped_files
 from sst_graph.data.pictures import PictureFiles, mask_encoding, point_labels
@@ -65,7 +65,7 @@ class CloudFiles:
     clock: PointClock | None = None
 
     def scan(self, k: int) -> Scan:
-        """Scan k; points that are NaN or inf are left out.
+        """Scan k; points that are NaN, inf or at the origin are left out.
 
         Raises:
             DataError: a file is damaged or holds what it must not.
@@ -73,7 +73,7 @@ class CloudFiles:
         stamp_ns = int(self.files.stamps_ns[k])
         cloud = read_cloud(self.files.paths[k])
         points = cloud.points()
-        used: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
+        used = are_returns(points)
         classes, instances = self._labels(k, cloud, used)
         offsets_s = None
         if self.stored_times and (times := cloud.offsets_s(stamp_ns, used, self.clock)) is not None:
@@ -94,7 +94,7 @@ class CloudFiles:
     def times(self, k: int) -> ScanTimes | None:
         """Times of the points of scan k; errors as of a scan."""
         cloud = read_cloud(self.files.paths[k])
-        values, used = cloud.times(), np.isfinite(cloud.points()).all(axis=1)
+        values, used = cloud.times(), are_returns(cloud.points())
         return None if values is None else ScanTimes(int(self.files.stamps_ns[k]), values[used])
 
     def _labels(

@@ -7,7 +7,7 @@ Below ``PATH/sequences/NN`` (or below PATH itself): ``calib.txt``, ``times.txt``
 stamps the scans alone.
 
 Some labels, masks and pictures may be missing: where nothing is labelled nothing is associated, and an image
-without its picture has no features. Points that are NaN or inf are left out and counted.
+without its picture has no features. Points that are NaN, inf or at the origin are left out and counted.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.data.arrays import read_offsets, read_points
+from sst_graph.data.arrays import are_returns, read_offsets, read_points
 from sst_graph.data.images import picture_size, read_instances
 from sst_graph.data.info.facts import SensorFacts, SourceFacts
 from sst_graph.data.kitti.calib import read_calibration
@@ -73,7 +73,7 @@ class KittiSource(IndexedSource):
         index = self._index(position)
         scan, image = self._scan(index), self._image(index)
         if image is not None:
-            image = replace(image, instances=self._instances(index))
+            image = replace(image, instances=self.instances(index))
         return Frame(index, scan, image)
 
     def read_scan(self, position: int) -> Scan | None:
@@ -107,8 +107,7 @@ class KittiSource(IndexedSource):
         """Scan of an index that has one; errors as of the frame."""
         path = self.files.scans[index]
         points, intensities = read_points(path)
-        # Beams without a return come as NaN from many drivers.
-        used: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
+        used = are_returns(points)
         classes, instances = point_labels(self.files.labels.get(index), used, path)
         offsets_s = self._offsets(index, points, used)
         points = np.ascontiguousarray(points[used])
@@ -121,7 +120,7 @@ class KittiSource(IndexedSource):
             rings=rings_from_order(points),
             left_out=len(used) - len(points),
         )
-        return with_intensities(scan, intensities[used])
+        return with_intensities(scan, None if intensities is None else intensities[used])
 
     def _offsets(
         self, index: int, points: NDArray[np.float32], used: NDArray[np.bool_]
@@ -139,7 +138,8 @@ class KittiSource(IndexedSource):
             return None
         return self.pictures.image(number, int(self.stamps_ns[index]))
 
-    def _instances(self, index: int) -> NDArray[np.uint16] | None:
+    def instances(self, index: int) -> NDArray[np.uint16] | None:
+        """Instances (h, w) of the image of an index, or None; errors as of the frame."""
         path = self.files.instances.get(index + self.options.image_shift)
         return None if path is None else read_instances(path, (self.camera.width, self.camera.height))
 
@@ -197,9 +197,13 @@ def _with_image_stamps(
     def image(k: int) -> CameraImage:
         return pictures.image(int(images[k]), int(image_stamps_ns[images[k]]))
 
+    def instances(k: int) -> NDArray[np.uint16] | None:
+        return source.instances(int(images[k]))
+
     files, missing = source.files, source.files.missing()
     of_scans = Sensor(source.stamps_ns[scans], scan, _folder(files.scans))
-    of_images = Sensor(image_stamps_ns[images], image, _folder(files.images or files.masks))
+    place = _folder(files.images or files.masks)
+    of_images = Sensor(image_stamps_ns[images], image, place, instances=instances)
     properties = replace(source.properties, notes=(missing,) if missing else ())
     return merged(properties, of_scans, of_images, options, folder, scans_are_complete=True)
 

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.cameras import CameraModel, Rectification
-from sst_graph.data.arrays import MAX_POINTS, check_metres, read_points
+from sst_graph.data.arrays import MAX_POINTS, are_returns, check_metres, read_points
 from sst_graph.data.images import picture_size
 from sst_graph.data.kitti.raw_calib import (
     CAM_TO_CAM,
@@ -94,16 +94,16 @@ class RawScans:
             DataError: a file is damaged or holds what it must not.
         """
         path = self.scans[number]
-        read = read_points if path.suffix.lower() == ".bin" else read_text_points
-        points, intensities = read(path)
-        used: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
+        is_text = path.suffix.lower() != ".bin"
+        points, intensities = read_text_points(path) if is_text else read_points(path)
+        used = are_returns(points)
         classes, instances = point_labels(self.labels.get(number), used, path)
         points = np.ascontiguousarray(points[used])
         offsets_s = None if self.turn is None else self.turn.offsets_s(number, stamp_ns, points)
         left_out = len(used) - len(points)
         rings = rings_from_order(points)
         scan = Scan(stamp_ns, points, classes, instances, offsets_s, rings, left_out)
-        return with_intensities(scan, intensities[used])
+        return with_intensities(scan, None if intensities is None else intensities[used])
 
 
 def read_text_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from sst_graph.cameras import CameraModel, Rectification
 from sst_graph.cameras.readers import camera_from_nuscenes
 from sst_graph.classes import classes_of_lidarseg
-from sst_graph.data.arrays import MAX_POINTS, check_metres, listed
+from sst_graph.data.arrays import MAX_POINTS, are_returns, check_metres, listed
 from sst_graph.data.nuscenes.tables import Record, pose_of, records, text_of, whole_of
 from sst_graph.data.pictures import PictureFiles
 from sst_graph.data.rectified import RectifiedSource
@@ -83,7 +83,7 @@ class LidarFiles:
         values = np.frombuffer(data, "<f4").reshape(-1, 5)
         points = np.ascontiguousarray(values[:, :3])
         check_metres(points, path)
-        used: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
+        used = are_returns(points)
         rings = values[used, 4]
         if not ((rings >= 0) & (rings < 256) & (rings == np.floor(rings))).all():
             raise DataError(path, "rings that are no whole numbers of 0 to 255", _PCD_BIN.name)

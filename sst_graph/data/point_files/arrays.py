@@ -2,8 +2,8 @@
 
 A .npy is a structured array with fields x, y, z, ..., or an array (n, 3) of x y z, which intensity and more
 may follow; an organized cloud has rows and columns in the place of n. A .npz has one array a field, or such
-an array, the only one of two or three dimensions or named ``points``, beside fields of their own. Nothing is
-unpickled.
+an array, the only one of two or three dimensions or named ``points``, beside fields of their own; single
+values are left out. Nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -88,7 +88,8 @@ def read_npz(data: bytes, path: Path) -> PointFields:
             for member in members:
                 with archive.open(member) as stream:
                     content = stream.read(member.file_size + 1)
-                arrays[member.filename.removesuffix(".npy")] = _array(content, path)
+                if (array := _array(content, path)).ndim:
+                    arrays[member.filename.removesuffix(".npy")] = array
     except (*_BROKEN, RuntimeError) as error:
         raise DataError(path, f"no .npz file ({first_line(error)})", "arrays that NumPy wrote") from None
     tables = [name for name, array in arrays.items() if array.ndim > 1]
@@ -119,14 +120,18 @@ def _array(data: bytes, path: Path) -> NDArray[Any]:
         or dtype.hasobject
         or dtype.itemsize == 0
         or dtype.itemsize > MAX_POINT_BYTES
-        or len(shape) not in (1, 2, 3)
+        or len(shape) > 3
     ):
         raise DataError(path, f"an array of {dtype}, shape {shape}", "numbers or structured records")
     count = 1
     for length in shape:
         count *= int(length)
     rest = len(data) - stream.tell()
-    if min(shape) < 0 or math.prod(shape[:-1] or shape) > MAX_POINTS or count * dtype.itemsize != rest:
+    if (
+        min(shape, default=0) < 0
+        or math.prod(shape[:-1] or shape) > MAX_POINTS
+        or count * dtype.itemsize != rest
+    ):
         raise DataError(
             path, f"{count_of(rest, 'byte')} behind the header", f"those of an array of shape {shape}"
         )

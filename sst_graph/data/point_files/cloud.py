@@ -53,13 +53,16 @@ class PointFields:
         return points
 
     def rings(self) -> NDArray[np.uint16] | None:
-        """Laser numbers (n,), or None.
+        """Laser numbers (n,), or None where there are none, or only one.
 
         Raises:
             DataError: one that is no whole number of 0 to 65535.
         """
         values = self._first(RINGS)
-        return None if values is None else self._whole(values, 0xFFFF, "rings").astype(np.uint16)
+        if values is None:
+            return None
+        rings = self._whole(values, 0xFFFF, "rings").astype(np.uint16)
+        return None if is_constant(rings) else rings
 
     def intensities(self) -> NDArray[np.float32] | None:
         """Strengths of the returns (n,), or None."""
@@ -146,6 +149,11 @@ def cloud_of(path: Path, fields: Mapping[str, NDArray[Any]]) -> PointFields:
             raise DataError(path, found, f"numbers, one a point ({count_of(count, 'point')})")
     check_count(path, count)
     return PointFields(path, used)
+
+
+def is_constant(rings: NDArray[np.uint16]) -> bool:
+    """Whether laser numbers (n,) of several points are all the same: drivers leave the field at 0."""
+    return len(rings) > 1 and bool((rings == rings[0]).all())
 
 
 def check_count(path: Path, count: int) -> None:

@@ -19,6 +19,8 @@ WITHOUT_TIMES = (
 
 _SCAN_LASTS_S = (0.005, 0.5)
 """From a narrow part of a fast sweep to a slow one: less than 1000 times longer, so at most one unit fits."""
+_CLEARLY_S = 0.01
+"""How much nearer to its stamp a scan begins or ends by its clock than after it: returns may be missing."""
 _OF_FLOATS_NS = (1_000_000_000, 1_000_000, 1_000, 1)
 _OF_WHOLE_NS = (1, 1_000, 1_000_000)
 """Units in which times are counted, the usual one first."""
@@ -36,17 +38,22 @@ def likely_seconds(values: NDArray[Any], stamp_ns: int) -> NDArray[np.float64] |
 
     Drivers count seconds in floats and nanoseconds in whole numbers, and some milliseconds or microseconds,
     after the stamp or on the stamp's clock. The unit is that by which the scan lasts 5 ms to 0.5 s within
-    FARTHEST_S of its stamp. Where none fits, it is the usual one, or absolute nanoseconds in floats (Livox),
-    whichever leaves the points nearest to the stamp: the caller checks the distance, and for NaN.
+    FARTHEST_S of its stamp. In the first second of a clock it may do so either way: times are then on the
+    stamp's clock where the scan begins or ends clearly nearer to its stamp by that. Where no unit fits, it is
+    the usual one, or absolute nanoseconds in floats (Livox), whichever leaves the points nearest to the
+    stamp: the caller checks the distance, and for NaN.
     """
     if tells_nothing(values):
         return None
     numbers, ends = counted(values)
     for unit_ns in units_ns(values):
+        nearest_s = {}
         for clock_ns in (0, stamp_ns):
             first, last = read_as(ends[0], unit_ns, clock_ns), read_as(ends[-1], unit_ns, clock_ns)
             if lasts_a_scan(last - first) and _farthest(first, last) <= FARTHEST_S:
-                return np.asarray(read_as(numbers, unit_ns, clock_ns))
+                nearest_s[clock_ns] = min(abs(first), abs(last)) + (_CLEARLY_S if clock_ns else 0.0)
+        if nearest_s:
+            return np.asarray(read_as(numbers, unit_ns, min(nearest_s, key=lambda clock: nearest_s[clock])))
     usual_ns = units_ns(values)[0]
     readings = [(usual_ns, 0), (usual_ns, stamp_ns), (1, stamp_ns)]
     nearest = min(readings, key=lambda r: max(_farthest(*(read_as(end, *r) for end in ends)), FARTHEST_S))

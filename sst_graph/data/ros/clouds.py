@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.data.arrays import MAX_POINTS
-from sst_graph.data.point_files.cloud import INTENSITIES, RINGS, TIMES
+from sst_graph.data.arrays import MAX_POINTS, are_returns
+from sst_graph.data.point_files.cloud import INTENSITIES, RINGS, TIMES, is_constant
 from sst_graph.data.point_times import FARTHEST_S, WITHOUT_TIMES, PointClock, seconds_after_stamp
 from sst_graph.errors import DataError, count_of
 from sst_graph.validation import FARTHEST_M
@@ -98,8 +98,7 @@ def _used(message: Any, place: str) -> tuple[NDArray[Any], NDArray[np.float32], 
     """Rows and coordinates (n, 3) of the points that are used, and how many are left out."""
     table = message if isinstance(message, np.ndarray) else _table(message, place)
     points = np.stack([np.asarray(table[axis], np.float64) for axis in "xyz"], axis=1).astype(np.float32)
-    # Drivers give NaN or the origin for beams without a return.
-    used = np.isfinite(points).all(axis=1) & (points != 0.0).any(axis=1)
+    used = are_returns(points)
     return table[used], np.ascontiguousarray(points[used]), int(len(used) - used.sum())
 
 
@@ -148,11 +147,12 @@ def _names(table: NDArray[Any]) -> tuple[str, ...]:
 
 
 def _rings(table: NDArray[Any]) -> NDArray[np.uint16] | None:
-    """Laser numbers; floats are taken where they hold such."""
+    """Laser numbers, if there are several; floats are taken where they hold such."""
     for name in RINGS:
         values = table[name] if name in _names(table) else None
         if values is not None and (values == values.astype(np.uint16)).all():
-            return values.astype(np.uint16)
+            rings = values.astype(np.uint16)
+            return None if is_constant(rings) else rings
     return None
 
 

@@ -21,10 +21,17 @@ _STEP_BACK_NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class Stamped:
-    """A message and its stamp [ns]."""
+    """A message.
+
+    Attributes:
+        stamp_ns: its stamp in the drive [ns].
+        message: where it stands.
+        header_ns: the stamp of its header [ns].
+    """
 
     stamp_ns: int
     message: Message
+    header_ns: int
 
 
 @dataclass(frozen=True)
@@ -53,6 +60,17 @@ class BagIndex:
     repeated: int
     received_ns: NDArray[np.int64]
 
+    def masks_by_image(self) -> dict[int, Stamped]:
+        """Masks by the stamps of their images, whose headers are stamped alike; where none is, as of drivers
+        that leave the stamp at zero, by the stamps in the drive.
+        """
+        by_header = {one.header_ns: one for one in reversed(self.masks) if one.header_ns}
+        found = {one.stamp_ns: by_header[one.header_ns] for one in self.images if one.header_ns in by_header}
+        if found:
+            return found
+        by_stamp = {one.stamp_ns: one for one in self.masks}
+        return {one.stamp_ns: by_stamp[one.stamp_ns] for one in self.images if one.stamp_ns in by_stamp}
+
 
 @dataclass
 class _Sensor:
@@ -73,11 +91,11 @@ def read_index(bag: Bag, topics: Topics, stamps: Stamps) -> BagIndex:
     infos = [] if topics.info is None else [topics.info.name]
     for message, data in bag.messages([*topics.sensors, *infos, *topics.transforms]):
         if message.topic in sensors:
-            stamp_ns, frame = bag.header(data)
+            header_ns, frame = bag.header(data)
             sensor = sensors[message.topic]
             sensor.frame = sensor.frame or frame
-            stamp_ns = message.received_ns if stamps == "received" else stamp_ns
-            sensor.stamped.append(Stamped(stamp_ns, message))
+            stamp_ns = message.received_ns if stamps == "received" else header_ns
+            sensor.stamped.append(Stamped(stamp_ns, message, header_ns))
             received.append(message.received_ns)
         elif message.topic in topics.transforms:
             transforms.add(bag.decoded(data, types[message.topic].type))

@@ -117,15 +117,15 @@ class BagSensors:
         return scan_of(message, stamped.stamp_ns, messages.place(stamped), self.reading)
 
     def image(self, k: int) -> CameraImage:
-        """Image k of the topic, with the mask of its stamp; errors as of a scan."""
+        """Image k of the topic, with its mask; errors as of a scan."""
         stamped, pixels = self.messages.index.images[k], self.messages.picture(k)
         check_size(pixels, self.size, self.messages.place(stamped))
         return CameraImage(stamped.stamp_ns, self._mask(self._masks.get(stamped.stamp_ns)), pixels)
 
     @cached_property
     def _masks(self) -> dict[int, Stamped]:
-        """By stamp."""
-        return {one.stamp_ns: one for one in self.messages.index.masks}
+        """By the stamps of their images."""
+        return self.messages.index.masks_by_image()
 
     def _mask(self, stamped: Stamped | None) -> NDArray[np.uint8]:
         """Classes (h, w); where there is no mask every pixel may be anything."""
@@ -241,16 +241,16 @@ def _stamps(stamped: Sequence[Stamped]) -> NDArray[np.int64]:
 
 
 def _check_masks(bag: Bag, index: BagIndex) -> None:
-    """A mask belongs to the image that has its stamp.
+    """A mask belongs to the image whose header has its stamp.
 
     Raises:
         DataError: none does.
     """
-    if index.masks and not np.intersect1d(_stamps(index.masks), _stamps(index.images)).size:
+    if index.masks and not index.masks_by_image():
         first = index.masks[0]
-        expected = f"the stamps of their images, such as {index.images[0].stamp_ns} ns"
+        expected = f"the stamps of their images, such as {index.images[0].header_ns} ns"
         place = f"{bag.path}, {first.message.topic}"
-        raise DataError(place, f"masks at other stamps, such as {first.stamp_ns} ns", expected)
+        raise DataError(place, f"masks at other stamps, such as {first.header_ns} ns", expected)
 
 
 def _geometry(

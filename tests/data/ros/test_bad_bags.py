@@ -23,6 +23,7 @@ from sst_graph.cli import main
 from sst_graph.data import open_source
 from sst_graph.errors import MissingDependencyError
 from sst_graph.factors.camera import PinholeCamera
+from sst_graph.types import SemanticClass
 
 CAMERA = PinholeCamera(30.0, 30.0, 16.0, 12.0, 32, 24)
 MAKE = Messages()
@@ -159,6 +160,28 @@ def test_stamps_of_zero_and_the_times_of_recording(
     assert "4 of 4 messages with stamp 0" in refused(capsys, path)
     stamps = [f.image.stamp_ns for f in open_source(path, stamps="received") if f.image is not None]
     assert stamps == [EPOCH_NS + k * 50_000_000 for k in range(4)]
+
+
+@pytest.mark.parametrize("header_ns", [0, EPOCH_NS])
+def test_masks_belong_to_their_images_at_the_times_of_recording(tmp_path: Path, header_ns: int) -> None:
+    """By their headers, where these are stamped."""
+
+    def masked(bag: BagWriter) -> None:
+        for k in range(3):
+            stamp_ns, received_ns = header_ns and header_ns + k, EPOCH_NS + k * 50_000_000
+            mask = np.full(PIXELS.shape[:2], 26 if k == 1 else 0, np.uint8)
+            bag.add(IMAGE, bag.messages.image(stamp_ns, PIXELS), received_ns)
+            bag.add(
+                MASK, bag.messages.image(stamp_ns, mask, "mono8"), received_ns + bool(header_ns) * 2_000_000
+            )
+
+    path = made(tmp_path, lambda bag: fill(bag, [IMAGE]), masked)
+    images = [frame.image for frame in open_source(path, stamps="received", mask_topic=MASK)]
+    assert [image.mask.max() == SemanticClass.VEHICLE for image in filter(None, images)] == [
+        False,
+        True,
+        False,
+    ]
 
 
 def test_stamps_that_jump_back(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

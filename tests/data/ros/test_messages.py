@@ -7,6 +7,7 @@ import tracemalloc
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -19,6 +20,7 @@ pytest.importorskip("rosbags")
 from bags import CAMERA_FRAME, EPOCH_NS, LIDAR_FRAME, Messages, chain
 
 from sst_graph.cameras import BrownConradyCamera
+from sst_graph.data.point_files import read_cloud
 from sst_graph.data.ros.camera_info import image_geometry
 from sst_graph.data.ros.clouds import MessagePoints, cloud_of
 from sst_graph.data.ros.images import mask_of, picture_of
@@ -259,6 +261,14 @@ def test_points_without_a_return_are_left_out_with_their_columns() -> None:
     assert cloud.left_out == 2 and len(cloud.points) == 3
     assert cloud.rings is not None and cloud.rings.tolist() == [0, 2, 4]
     assert cloud.offsets_s is not None and cloud.offsets_s[1] == np.float32(0.025)
+
+
+def test_a_single_laser_number_tells_no_lasers(tmp_path: Path) -> None:
+    """Drivers leave the field at 0; lasers then follow from the order of the points."""
+    assert read(table(ring=np.zeros(5, "<u2"))).rings is None
+    rows = table(ring=np.full(5, 7, "<u2"))
+    np.save(tmp_path / "a.npy", rows)
+    assert read_cloud(tmp_path / "a.npy").rings() is None
 
 
 def test_values_beyond_32_bits_are_left_out_in_silence() -> None:
