@@ -119,7 +119,9 @@ def test_incremental_solvers_come_to_the_truth(street: Street, kind: str) -> Non
     found = street.frame_by_frame(solver_of(kind, 1.25), street.start(1))
     rotation_deg, translation_m, time_offset_s = street.errors(found.values)
     assert found.converged and found.kernel_px == 4.0
-    assert rotation_deg < 0.1 and translation_m < 0.02 and time_offset_s < 0.003
+    assert rotation_deg < 0.1 and translation_m < 0.02
+    # A smoother of 1.25 s knows the offset to 8 ms.
+    assert time_offset_s < (0.002 if kind == "isam2" else 0.003)
     assert street.nees(found.values, found.covariance) < 14.0
     assert found.values.exists(X(0)) == (kind == "isam2")
 
