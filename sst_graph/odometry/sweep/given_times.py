@@ -78,8 +78,7 @@ def compared_with_times(decision: SweepDecision, turn_s: float) -> SweepDecision
         contradiction = (
             f"the times of the points say {_words(turn_s, period_s)}, the scans "
             f"{decision.kind if known else 'another sweep'} ({decision.evidence}): correct the times"
-            + f", or say --sweep {decision.kind}, which leaves them out"
-            * known
+            + f", or say --sweep {decision.kind}, which leaves them out" * known
         )
     return decision.as_given(contradiction)
 
