@@ -93,7 +93,7 @@ class Scan(ByValue):
         offsets_s: (n,) float32, time of each point minus ``stamp_ns`` [s], or None where all
             points are taken at (or compensated to) the stamp.
         rings: (n,) uint16 laser number, or None where the data does not name it.
-        left_out: number of further points in the data, which were NaN or inf.
+        left_out: number of further points in the data, which were NaN, inf or at the origin.
     """
 
     stamp_ns: int

@@ -70,11 +70,14 @@ def palette_of(data: bytes) -> NDArray[np.uint8] | None:
     """Colours (n, 3) by index of a whole PNG file of indices; None of another one."""
     if not data.startswith(PNG) or data[_COLOUR_TYPE] != _OF_PALETTE:
         return None
-    at, kind, length = len(PNG), b"", 0
-    while kind not in (b"PLTE", b"IEND"):
-        at += length and length + 12
+    at = len(PNG)
+    while True:
         length, kind = int.from_bytes(data[at : at + 4], "big"), data[at + 4 : at + 8]
-    return np.frombuffer(data, np.uint8, length // 3 * 3, at + 8).reshape(-1, 3)
+        if kind in (b"PLTE", b"IEND", b""):
+            break
+        at += length + 12
+    colours = data[at + 8 : at + 8 + length] if kind == b"PLTE" else b""
+    return np.frombuffer(colours, np.uint8, len(colours) // 3 * 3).reshape(-1, 3)
 
 
 def _png_size(data: bytes, path: str | Path) -> tuple[int, int]:

@@ -162,6 +162,18 @@ def test_a_process_without_stderr_reads_pictures_too(tmp_path: Path) -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+def test_a_palette_behind_an_empty_chunk_is_found(tmp_path: Path) -> None:
+    path = tmp_path / "mask.png"
+    mask = Image.fromarray(np.array([[0, 1, 2]], np.uint8), "P")
+    mask.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0])
+    mask.save(path)
+    data, end_of_header = path.read_bytes(), 33
+    empty = bytes(4) + b"tEXt" + zlib.crc32(b"tEXt").to_bytes(4, "big")
+    path.write_bytes(data[:end_of_header] + empty + data[end_of_header:])
+    with pytest.raises(DataError, match=r"mask\.png: found a palette of colours"):
+        read_mask(path)
+
+
 def test_a_palette_of_colours_is_named(tmp_path: Path) -> None:
     """As segmentation tools write masks for the eye. Of greys the indices may be meant, or the greys."""
     mask = Image.fromarray(np.array([[0, 1], [2, 1]], np.uint8), "P")
