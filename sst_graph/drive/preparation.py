@@ -197,7 +197,7 @@ class LeftOut:
     """Counts of what a drive lacked; the rest of it was used.
 
     Attributes:
-        points: that were NaN or inf.
+        points: that were NaN, inf or at the origin.
         scans_with_such_points: scans that held some.
         scans_without_labels: these show motion only.
         images_without_mask: nothing is associated with these.
