@@ -81,7 +81,7 @@ def checked(
 @pytest.mark.slow
 def test_constant_speed() -> None:
     """Outlines do not separate forward and time offset; the pitching of the body does."""
-    drive = street(motion="constant")
+    drive = street(motion="constant", frames=16)
     result, _ = checked(drive, "use_motion=never")
     (weak,) = result.weak_directions
     assert abs(weak.vector[3]) > 0.5 and abs(weak.vector[6]) > 0.1  # forward against the offset
