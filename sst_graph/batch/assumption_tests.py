@@ -36,6 +36,7 @@ from sst_graph.drive.stages import stage, under
 from sst_graph.errors import EstimationError
 from sst_graph.graph.building import state_from
 from sst_graph.graph.elimination import Eliminated, Unknowns
+from sst_graph.graph.known import information_beside
 from sst_graph.graph.linear import scaled_inverse
 from sst_graph.graph.outer_loop import JointSolution, explained, solve_joint
 from sst_graph.graph.state import State, nuisance_key
@@ -194,7 +195,7 @@ class LinearProblem:
         values: of the free parameters at the optimum, by name.
         state: the optimum.
         by_image: derivatives of the residuals by shifts of their image, and its number.
-        known: (n, n) information that is not of the matches; None without any.
+        known: (n, n) information that is not of the matches.
     """
 
     table: MatchTable
@@ -203,7 +204,7 @@ class LinearProblem:
     values: dict[str, float]
     state: State
     by_image: tuple[FloatArray, IntArray]
-    known: FloatArray | None
+    known: FloatArray
 
     @classmethod
     def of(cls, problem: SolvedProblem, names: Sequence[str]) -> LinearProblem:
@@ -221,8 +222,7 @@ class LinearProblem:
         state = state_from(at, solution.state, pairs)
         free = {name: state.nuisances[name] for name in names}
         by_image = columns_by_image(table, pairs, at, state)
-        prior = solution.problem.prior
-        known = None if prior is None else prior.information_on(unknowns)
+        known = information_beside(solution.problem.prior, unknowns)
         return cls(table, unknowns, information, free, state, by_image, known)
 
     def alone(self, name: str, config: AssumptionConfig) -> ParameterTest:
@@ -230,7 +230,7 @@ class LinearProblem:
         step, kept, bread = self._step_to(name)
         moved = self.table.after(step)
         table = _centred(replace(moved, J=moved.J[:, kept]), bread)
-        known = None if self.known is None else self.known[np.ix_(kept, kept)]
+        known = self.known[np.ix_(kept, kept)]
         covariance = covariance_of(bread, table, fit_error_model(table.residuals), known=known)
         column = self.unknowns.column(nuisance_key(name))
         place = int(np.searchsorted(kept, column))

@@ -19,9 +19,8 @@ from sst_graph.covariance.considered import Considered, budget, motion_covarianc
 from sst_graph.covariance.image_shifts import ImageShifts, image_shifts
 from sst_graph.covariance.undecided_sweep import SweepEffect
 from sst_graph.covariance.unknown_motion import unknown_motion_covariance
-from sst_graph.graph.frozen_problem import FrozenProblem
 from sst_graph.graph.matching import DriveMatches
-from sst_graph.graph.outer_loop import JointConfig, JointSolution
+from sst_graph.graph.outer_loop import JointSolution
 from sst_graph.odometry.sweep import SweepTiming
 from sst_graph.types import FloatArray
 
@@ -62,11 +61,10 @@ def total_covariance(
     Args:
         considered: what the assumptions add.
     """
-    solution, joint = estimate.solution, problem.config.joint
+    solution = estimate.solution
     size = 6 + len(solution.state.time_offsets_s)
     # 1. Matches, pictures that shift from image to image, and assumptions.
-    prior = solution.problem.prior
-    motion = motion_covariance(estimate.robust, solution.pairs, solution.state, joint.graph, prior)
+    motion = motion_covariance(estimate.robust, solution)
     shifts = image_shifts(estimate.robust, solution.pairs, solution.values, solution.state)
     parts = budget(estimate.covariance, motion, shifts.covariance, considered)
     unknowns = estimate.covariance[:size, :size] + shifts.covariance + considered.covariance(size)
@@ -122,10 +120,7 @@ def sweep_effects(
         sweep = drive.sweep
         if sweep is None or sweep.kind != "undecided" or not sweep.others:
             continue
-        steps = {
-            timing.fraction: sweep_step(solution, {number: timing}, problem.config.joint)
-            for timing in sweep.others
-        }
+        steps = {timing.fraction: sweep_step(solution, {number: timing}) for timing in sweep.others}
         effect = SweepEffect.of(sweep, steps, covariance)
         added += effect.covariance
         if effect.sentence:
@@ -133,9 +128,7 @@ def sweep_effects(
     return SweepEffects(tuple(reasons), added)
 
 
-def sweep_step(
-    solution: JointSolution, timings: Mapping[int, SweepTiming], config: JointConfig
-) -> FloatArray:
+def sweep_step(solution: JointSolution, timings: Mapping[int, SweepTiming]) -> FloatArray:
     """(7,) change of extrinsic and (first) offset when the points of some drives have other times.
 
     On the frozen matches; right perturbation, [rad, m, s].
@@ -147,10 +140,7 @@ def sweep_step(
         _retimed(own, timings[own.number]) if own.number in timings else own for own in solution.matches
     ]
     before, after = (
-        FrozenProblem(
-            used, solution.frozen.state, config.graph, solution.centre, solution.problem.prior
-        ).optimum(_ITERATIONS)[0]
-        for used in (solution.matches, retimed)
+        frozen.optimum(_ITERATIONS)[0] for frozen in (solution.frozen, solution.frozen_with(retimed))
     )
     step = gtsam.Pose3.Logmap(before.cTl.between(after.cTl))
     return np.append(step, after.scalars[0] - before.scalars[0])

@@ -27,7 +27,7 @@ from sst_graph.covariance.jackknife import ObjectSpread, composed, steps_without
 from sst_graph.covariance.match_table import MatchTable, match_table
 from sst_graph.covariance.sums import ScoreSums
 from sst_graph.graph.elimination import Eliminated, Unknowns
-from sst_graph.graph.known import KnownCalibration
+from sst_graph.graph.known import KnownCalibration, information_beside
 from sst_graph.graph.matching import PairMatches
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import ObjectId
@@ -44,7 +44,7 @@ class RobustCovariance:
         model: the error model behind it.
         unknowns: its columns.
         table: the matches.
-        known: (n, n) information that is not of the matches, and is right as it is; None without any.
+        known: (n, n) information that is not of the matches, and is right as it is.
     """
 
     matrix: FloatArray
@@ -52,7 +52,7 @@ class RobustCovariance:
     model: ErrorModel
     unknowns: Unknowns
     table: MatchTable
-    known: FloatArray | None = None
+    known: FloatArray
 
 
 def robust_covariance(
@@ -74,7 +74,7 @@ def robust_covariance(
     bread = eliminated.covariance()
     table = match_table(eliminated, values, pairs, state, tracks)
     model = fit_error_model(table.residuals)
-    known = None if prior is None else prior.information_on(unknowns)
+    known = information_beside(prior, unknowns)
     matrix = covariance_of(bread, table, model, known=known)
     return RobustCovariance(matrix, bread, model, unknowns, table, known)
 

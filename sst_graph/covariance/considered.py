@@ -21,11 +21,11 @@ from sst_graph.assumptions import ASSUMPTIONS, held_at_zero, named_sigmas
 from sst_graph.config import Settings, setting
 from sst_graph.covariance.cluster_robust import RobustCovariance
 from sst_graph.covariance.match_table import MatchTable
-from sst_graph.graph.building import joint_graph
 from sst_graph.graph.elimination import marginal_covariance
 from sst_graph.graph.known import KnownCalibration
-from sst_graph.graph.matching import GraphConfig, PairMatches
+from sst_graph.graph.matching import PairMatches
 from sst_graph.graph.nuisances import residual_columns
+from sst_graph.graph.outer_loop import JointSolution
 from sst_graph.graph.state import State, twist_key
 from sst_graph.types import FloatArray
 
@@ -205,30 +205,19 @@ def considered_by_steps(steps: Mapping[str, FloatArray], config: AssumptionConfi
     return Considered(steps, {name: config.sigma(name) for name in steps})
 
 
-def motion_covariance(
-    robust: RobustCovariance,
-    pairs: Sequence[PairMatches],
-    state: State,
-    config: GraphConfig,
-    prior: KnownCalibration | None = None,
-) -> FloatArray:
+def motion_covariance(robust: RobustCovariance, solution: JointSolution) -> FloatArray:
     """(n, n) part of the covariance that is there because the LiDAR's motion is measured, not known.
 
     The difference to the same problem with a motion a thousand times as well known.
-
-    Args:
-        prior: what is known beside the matches.
     """
     known = [
         replace(pair, l_twist=replace(pair.l_twist, covariance=1e-6 * pair.l_twist.covariance))
         if pair.l_twist is not None
         else pair
-        for pair in pairs
+        for pair in solution.pairs
     ]
-    graph, values = joint_graph(known, state, config)
-    if prior is not None:
-        graph.add(prior.factor([*state.nuisances]))
-    return np.asarray(robust.bread - marginal_covariance(graph, values, robust.unknowns))
+    graph = solution.graph_of(known)
+    return np.asarray(robust.bread - marginal_covariance(graph, solution.values, robust.unknowns))
 
 
 def budget(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -70,13 +71,7 @@ def palette_of(data: bytes) -> NDArray[np.uint8] | None:
     """Colours (n, 3) by index of a whole PNG file of indices; None of another one."""
     if not data.startswith(PNG) or data[_COLOUR_TYPE] != _OF_PALETTE:
         return None
-    at = len(PNG)
-    while True:
-        length, kind = int.from_bytes(data[at : at + 4], "big"), data[at + 4 : at + 8]
-        if kind in (b"PLTE", b"IEND", b""):
-            break
-        at += length + 12
-    colours = data[at + 8 : at + 8 + length] if kind == b"PLTE" else b""
+    colours = next((data[at + 8 : end - 4] for kind, at, end in _png_chunks(data) if kind == b"PLTE"), b"")
     return np.frombuffer(colours, np.uint8, len(colours) // 3 * 3).reshape(-1, 3)
 
 
@@ -125,18 +120,24 @@ def _check_jpeg_end(data: bytes, path: str | Path) -> None:
         raise DataError(path, "a truncated JPEG file", "an end-of-image marker")
 
 
-def _check_png_chunks(data: bytes, path: str | Path) -> None:
-    at = len(PNG)
-    while at + 12 <= len(data):
+def _png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
+    """Kind, begin and end of each whole chunk of a PNG file, up to the last one."""
+    kind, end = b"", len(PNG)
+    while kind != b"IEND" and end + 12 <= len(data):
+        at = end
         (length,) = struct.unpack_from(">I", data, at)
-        end = at + 12 + length
+        kind, end = data[at + 4 : at + 8], at + 12 + length
         if end > len(data):
-            break
+            return
+        yield kind, at, end
+
+
+def _check_png_chunks(data: bytes, path: str | Path) -> None:
+    for kind, at, end in _png_chunks(data):
         if zlib.crc32(data[at + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
             raise DataError(path, f"a damaged PNG chunk at byte {at}", "one that fits its checksum")
-        if data[at + 4 : at + 8] == b"IEND":
+        if kind == b"IEND":
             return
-        at = end
     raise DataError(path, f"a PNG file truncated at byte {len(data)}", "its last chunk IEND")
 
 

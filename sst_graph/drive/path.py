@@ -17,6 +17,7 @@ _REACH = 2
 _NODES = 2 * _REACH + 2
 """Most poses that such a polynomial of an interval follows from."""
 _LONG_REACH = 4
+_LONG_NODES = 2 * _LONG_REACH + 2
 """The same of the longer polynomials that show how far fast motion is smoothed away."""
 _SMOOTHED_AWAY = 2.0
 """What is smoothed away over the difference of longer and usual polynomials: in the middle between stamps of
@@ -168,12 +169,11 @@ class SensorPath:
     def _smoothed_away(self, intervals: IntArray, stamps_ns: NDArray[np.int64]) -> FloatArray:
         """(n, 6) what the interpolated poses lack of fast motion, at times (n,) in intervals (n,)."""
         seconds = (stamps_ns - self._stamps[intervals])[:, None] * 1e-9
-        found = np.zeros((len(seconds), 6))
-        for sign, reach in ((1.0, _LONG_REACH), (-1.0, _REACH)):
-            terms = 2 * reach + 2
-            coefficients = [self._polynomial(i, reach).coefficients for i in intervals.tolist()]
-            by_power = np.reshape(coefficients, (len(found), terms, 6))
-            found += sign * np.einsum("np,npk->nk", seconds ** np.arange(terms), by_power)
+        lacking = np.zeros((len(seconds), _LONG_NODES, 6))
+        for own, i in zip(lacking, intervals.tolist(), strict=True):
+            own += self._polynomial(i, _LONG_REACH).coefficients
+            own[:_NODES] -= self._polynomial(i, _REACH).coefficients
+        found: FloatArray = np.einsum("np,npk->nk", seconds ** np.arange(_LONG_NODES), lacking)
         return _SMOOTHED_AWAY * found
 
     def _squared_errors(self, intervals: IntArray, stamps_ns: NDArray[np.int64]) -> FloatArray:

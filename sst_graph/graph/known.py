@@ -48,15 +48,6 @@ class KnownCalibration:
         """(7, k) information that extrinsic and offset share with parameters."""
         return np.asarray(self.information @ self.columns(names), np.float64)
 
-    def information_on(self, unknowns: Unknowns) -> FloatArray:
-        """(n, n) information on all unknowns, estimated parameters that the mean follows among them."""
-        jacobian = np.zeros((7, unknowns.size))
-        jacobian[:, :7] = np.eye(7)
-        for name, step in self.steps.items():
-            if nuisance_key(name) in unknowns.keys:
-                jacobian[:, unknowns.column(nuisance_key(name))] = step
-        return np.asarray(jacobian.T @ self.information @ jacobian)
-
     def factor(self, free: Sequence[str] = ()) -> gtsam.LinearContainerFactor:
         """[Log(E_0^-1 E); D - D_0] + s theta, linear about the mean (E_0, D_0).
 
@@ -73,6 +64,19 @@ class KnownCalibration:
         for name in names:
             point.insert(nuisance_key(name), np.zeros(1))
         return quadratic_factor(variables, jacobian.T @ self.information @ jacobian, point)
+
+
+def information_beside(prior: KnownCalibration | None, unknowns: Unknowns) -> FloatArray:
+    """(n, n) information of what is known beside the matches on all unknowns, estimated parameters that its
+    mean follows among them; 0 where nothing is."""
+    if prior is None:
+        return np.zeros((unknowns.size, unknowns.size))
+    jacobian = np.zeros((7, unknowns.size))
+    jacobian[:, :7] = np.eye(7)
+    for name, step in prior.steps.items():
+        if nuisance_key(name) in unknowns.keys:
+            jacobian[:, unknowns.column(nuisance_key(name))] = step
+    return np.asarray(jacobian.T @ prior.information @ jacobian)
 
 
 def motion_steps(camera: PinholeCamera, cTl: gtsam.Pose3) -> dict[str, FloatArray]:

@@ -165,10 +165,19 @@ class JointSolution:
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """The last frozen problem as a graph. Many solutions are compared by their states alone: it is made
         where it is asked for."""
-        graph, _ = joint_graph(self.pairs, self.frozen.state, self.problem.config.graph, self.centre)
+        return self.graph_of(self.pairs)
+
+    def graph_of(self, pairs: Sequence[PairMatches]) -> gtsam.NonlinearFactorGraph:
+        """The last frozen problem with other matches as a graph."""
+        graph, _ = joint_graph(pairs, self.frozen.state, self.problem.config.graph, self.centre)
         if self.problem.prior is not None:
             graph.add(self.problem.prior.factor([*self.state.nuisances]))
         return graph
+
+    def frozen_with(self, matches: Sequence[DriveMatches]) -> FrozenProblem:
+        """The last frozen problem with other matches."""
+        prior = self.problem.prior
+        return FrozenProblem(matches, self.frozen.state, self.problem.config.graph, self.centre, prior)
 
     @cached_property
     def values(self) -> gtsam.Values:

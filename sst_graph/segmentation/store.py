@@ -153,11 +153,8 @@ class LabelStore:
         ids = cityscapes_ids_of(labels.mask)
         if labels.instances is not None:
             if (most := int(labels.instances.max(initial=0))) > _MOST_INSTANCES:
-                place, expected = (
-                    f"the image stamped {image.stamp_ns} ns",
-                    f"at most {_MOST_INSTANCES} a class",
-                )
-                raise DataError(place, f"instance {most}", expected)
+                place = f"the image stamped {image.stamp_ns} ns"
+                raise DataError(place, f"instance {most}", f"at most {_MOST_INSTANCES} a class")
             numbered = np.where(labels.instances > 0, ids.astype(np.uint16) * 256 + labels.instances, 0)
             # Before the mask: where that is found, nothing is missing.
             atomic_write_bytes(_instances_path(path), _png(numbered.astype(np.uint16)))
