@@ -13,7 +13,7 @@ from sst_graph.drive.preparation import Drive, ImageFeatures, ScanFeatures
 from sst_graph.errors import EstimationError
 from sst_graph.factors import frame_factor, time_offset_prior
 from sst_graph.factors.matches import Alignment
-from sst_graph.graph.elimination import Unknowns, marginal_covariance
+from sst_graph.graph.linear import information_inverse, ordering_of
 from sst_graph.graph.state import EXTRINSIC, time_offset_key
 from sst_graph.result import FrameId
 from sst_graph.types import Calibration, FloatArray, SemanticClass
@@ -198,5 +198,5 @@ def frozen_covariance(
     graph.add(time_offset_prior(TIME_OFFSET, at.time_offset_s, TIME_OFFSET_SIGMA_S))
     rest = gtsam.noiseModel.Diagonal.Sigmas(REST_SIGMAS)
     graph.add(gtsam.PriorFactorPose3(EXTRINSIC, at.cTl, rest))
-    covariance = marginal_covariance(graph, values, Unknowns((EXTRINSIC, TIME_OFFSET)))
-    return 0.5 * (covariance + covariance.T)
+    ordering = ordering_of((EXTRINSIC, TIME_OFFSET))
+    return information_inverse(graph.linearize(values).hessian(ordering)[0])

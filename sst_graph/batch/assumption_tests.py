@@ -16,6 +16,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import gtsam
@@ -30,13 +31,10 @@ from sst_graph.covariance.cluster_robust import RobustCovariance, covariance_of
 from sst_graph.covariance.considered import AssumptionConfig, Considered
 from sst_graph.covariance.error_model import fit_error_model
 from sst_graph.covariance.image_shifts import columns_by_image, shifts_of
-from sst_graph.covariance.match_table import MatchTable, match_table
+from sst_graph.covariance.match_table import MatchTable
 from sst_graph.covariance.observability import weak_directions
 from sst_graph.drive.stages import stage, under
 from sst_graph.errors import EstimationError
-from sst_graph.graph.building import state_from
-from sst_graph.graph.elimination import Eliminated, Unknowns
-from sst_graph.graph.known import information_beside
 from sst_graph.graph.linear import scaled_inverse
 from sst_graph.graph.outer_loop import JointSolution, explained, solve_joint
 from sst_graph.graph.state import State, nuisance_key
@@ -189,22 +187,16 @@ class LinearProblem:
     """The problem with many parameters free, linear about its optimum.
 
     Attributes:
-        table: its matches.
-        unknowns: columns of the table.
-        information: (n, n) of the unknowns, motion marginalised out, priors included.
+        robust: its matches and their information, priors included.
         values: of the free parameters at the optimum, by name.
         state: the optimum.
         by_image: derivatives of the residuals by shifts of their image, and its number.
-        known: (n, n) information that is not of the matches.
     """
 
-    table: MatchTable
-    unknowns: Unknowns
-    information: FloatArray
+    robust: RobustCovariance
     values: dict[str, float]
     state: State
     by_image: tuple[FloatArray, IntArray]
-    known: FloatArray
 
     @classmethod
     def of(cls, problem: SolvedProblem, names: Sequence[str]) -> LinearProblem:
@@ -214,25 +206,23 @@ class LinearProblem:
             EstimationError: too few matches, or another optimum from near matches, too.
         """
         solution = _solved_with_all(problem, names)
-        graph, at, pairs = solution.graph, solution.values, solution.pairs
-        unknowns = Unknowns.of(solution.state, pairs)
-        eliminated = Eliminated.of(graph, at, unknowns)
-        table = match_table(eliminated, at, pairs, solution.frozen.state, problem.objects)
-        information = scaled_inverse(eliminated.covariance())
-        state = state_from(at, solution.state, pairs)
-        free = {name: state.nuisances[name] for name in names}
-        by_image = columns_by_image(table, pairs, at, state)
-        known = information_beside(solution.problem.prior, unknowns)
-        return cls(table, unknowns, information, free, state, by_image, known)
+        robust, state = robust_of(solution, problem.objects), solution.frozen.state_at(solution.optimum)
+        by_image = columns_by_image(robust.table, solution.pairs, solution.values, state)
+        return cls(robust, {name: state.nuisances[name] for name in names}, state, by_image)
+
+    @cached_property
+    def information(self) -> FloatArray:
+        """(n, n) of the unknowns, motion marginalised out."""
+        return scaled_inverse(self.robust.bread)
 
     def alone(self, name: str, config: AssumptionConfig) -> ParameterTest:
         """Estimate of one parameter while the others of them are zero."""
         step, kept, bread = self._step_to(name)
-        moved = self.table.after(step)
+        moved = self.robust.table.after(step)
         table = _centred(replace(moved, J=moved.J[:, kept]), bread)
-        known = self.known[np.ix_(kept, kept)]
+        known = self.robust.known[np.ix_(kept, kept)]
         covariance = covariance_of(bread, table, fit_error_model(table.residuals), known=known)
-        column = self.unknowns.column(nuisance_key(name))
+        column = self.robust.unknowns.column(nuisance_key(name))
         place = int(np.searchsorted(kept, column))
         variance = float(covariance[place, place])
         sigma = _deviation(variance, bread[place], table, self.by_image, config.threshold)
@@ -259,10 +249,11 @@ class LinearProblem:
 
         With the steps d_o of the others given, the rest moves by d = -Λ_dd^-1 Λ_do d_o.
         """
-        columns = {each: self.unknowns.column(nuisance_key(each)) for each in self.values}
+        unknowns = self.robust.unknowns
+        columns = {each: unknowns.column(nuisance_key(each)) for each in self.values}
         fixed = np.array([column for each, column in columns.items() if each != name], dtype=np.intp)
-        kept = np.setdiff1d(np.arange(self.unknowns.size), fixed)
-        step = np.zeros(self.unknowns.size)
+        kept = np.setdiff1d(np.arange(unknowns.size), fixed)
+        step = np.zeros(unknowns.size)
         step[fixed] = [-value for each, value in self.values.items() if each != name]
         bread = scaled_inverse(self.information[np.ix_(kept, kept)])
         step[kept] = -bread @ (self.information[np.ix_(kept, fixed)] @ step[fixed])

@@ -155,7 +155,7 @@ class MatchedDrives:
 def robust_of(solution: JointSolution, objects: Sequence[dict[ObjectId, int]]) -> RobustCovariance:
     """The cluster-robust covariance of a solution."""
     made_at, prior = solution.frozen.state, solution.problem.prior
-    return robust_covariance(solution.graph, solution.values, solution.pairs, made_at, objects, prior)
+    return robust_covariance(solution.system, solution.values, solution.pairs, made_at, objects, prior)
 
 
 @dataclass(frozen=True)

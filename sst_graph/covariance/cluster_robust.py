@@ -18,6 +18,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -26,7 +27,7 @@ from sst_graph.covariance.error_model import ErrorModel, fit_error_model
 from sst_graph.covariance.jackknife import ObjectSpread, composed, steps_without
 from sst_graph.covariance.match_table import MatchTable, match_table
 from sst_graph.covariance.sums import ScoreSums
-from sst_graph.graph.elimination import Eliminated, Unknowns
+from sst_graph.graph.elimination import NormalEquations, Unknowns
 from sst_graph.graph.known import KnownCalibration, information_beside
 from sst_graph.graph.matching import PairMatches
 from sst_graph.graph.state import State
@@ -39,44 +40,49 @@ class RobustCovariance:
     """A cluster-robust covariance and what it was made of.
 
     Attributes:
-        matrix: (n, n) covariance of [extrinsic 6, offsets, biases].
-        bread: (n, n) the same if all matches were independent.
-        model: the error model behind it.
+        bread: (n, n) covariance of [extrinsic 6, offsets, parameters, biases] if all matches were
+            independent.
         unknowns: its columns.
         table: the matches.
         known: (n, n) information that is not of the matches, and is right as it is.
     """
 
-    matrix: FloatArray
     bread: FloatArray
-    model: ErrorModel
     unknowns: Unknowns
     table: MatchTable
     known: FloatArray
 
+    @cached_property
+    def model(self) -> ErrorModel:
+        """The error model of the matches."""
+        return fit_error_model(self.table.residuals)
+
+    @cached_property
+    def matrix(self) -> FloatArray:
+        """(n, n) cluster-robust covariance."""
+        return covariance_of(self.bread, self.table, self.model, known=self.known)
+
 
 def robust_covariance(
-    graph: gtsam.NonlinearFactorGraph,
+    system: NormalEquations,
     values: gtsam.Values,
     pairs: Sequence[PairMatches],
     state: State,
     tracks: Sequence[dict[ObjectId, int]],
     prior: KnownCalibration | None = None,
 ) -> RobustCovariance:
-    """Covariance of the unknowns that are not motion, from a frozen graph and its matches.
+    """Covariance of the unknowns that are not motion, from a frozen problem and its matches.
 
     Args:
+        system: the problem, linear at its optimum ``values``.
         state: that the matches were made at.
         prior: what is known beside the matches, a factor of the graph.
     """
-    unknowns = Unknowns.of(state, pairs)
-    eliminated = Eliminated.of(graph, values, unknowns)
-    bread = eliminated.covariance()
-    table = match_table(eliminated, values, pairs, state, tracks)
-    model = fit_error_model(table.residuals)
-    known = information_beside(prior, unknowns)
-    matrix = covariance_of(bread, table, model, known=known)
-    return RobustCovariance(matrix, bread, model, unknowns, table, known)
+    table, known = (
+        match_table(system, values, pairs, state, tracks),
+        information_beside(prior, system.unknowns),
+    )
+    return RobustCovariance(system.covariance(), system.unknowns, table, known)
 
 
 def covariance_of(

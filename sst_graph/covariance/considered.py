@@ -21,9 +21,8 @@ from sst_graph.assumptions import ASSUMPTIONS, held_at_zero, named_sigmas
 from sst_graph.config import Settings, setting
 from sst_graph.covariance.cluster_robust import RobustCovariance
 from sst_graph.covariance.match_table import MatchTable
-from sst_graph.graph.elimination import marginal_covariance
 from sst_graph.graph.known import KnownCalibration
-from sst_graph.graph.matching import PairMatches
+from sst_graph.graph.matching import DriveMatches, PairMatches
 from sst_graph.graph.nuisances import residual_columns
 from sst_graph.graph.outer_loop import JointSolution
 from sst_graph.graph.state import State, twist_key
@@ -210,14 +209,17 @@ def motion_covariance(robust: RobustCovariance, solution: JointSolution) -> Floa
 
     The difference to the same problem with a motion a thousand times as well known.
     """
-    known = [
-        replace(pair, l_twist=replace(pair.l_twist, covariance=1e-6 * pair.l_twist.covariance))
-        if pair.l_twist is not None
-        else pair
-        for pair in solution.pairs
-    ]
-    graph = solution.graph_of(known)
-    return np.asarray(robust.bread - marginal_covariance(graph, solution.values, robust.unknowns))
+    known = solution.frozen_with([_with_known_motion(own) for own in solution.matches])
+    return np.asarray(robust.bread - known.linearized(solution.optimum).covariance())
+
+
+def _with_known_motion(matches: DriveMatches) -> DriveMatches:
+    """The matches with the motion a thousand times as well known."""
+    twists = matches.motions.l_twists
+    if twists is None:
+        return matches
+    known = replace(twists, covariances=1e-6 * twists.covariances)
+    return replace(matches, motions=replace(matches.motions, l_twists=known))
 
 
 def budget(

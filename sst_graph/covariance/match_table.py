@@ -19,7 +19,7 @@ from sst_graph.covariance.sums import ScoreSums
 from sst_graph.factors.alignment import weighted_residuals
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.building import bias_groups, state_from
-from sst_graph.graph.elimination import Eliminated, Unknowns
+from sst_graph.graph.elimination import NormalEquations, Unknowns
 from sst_graph.graph.matching import PairMatches
 from sst_graph.graph.state import State, nuisance_key, time_offset_key, twist_key
 from sst_graph.objects.tracks import ObjectId
@@ -95,23 +95,23 @@ class MatchTable:
 
 
 def match_table(
-    eliminated: Eliminated,
+    system: NormalEquations,
     values: gtsam.Values,
     pairs: Sequence[PairMatches],
     state: State,
     tracks: Sequence[dict[ObjectId, int]],
 ) -> MatchTable:
-    """All matches of the frozen graph at its optimum, with the clusters they belong to.
+    """All matches of the frozen problem at its optimum, with the clusters they belong to.
 
     Args:
-        eliminated: the graph, linear at its optimum ``values``.
+        system: the problem, linear at its optimum ``values``.
         state: that the matches were made at.
         tracks: of each drive's objects.
     """
     made_at = state.nuisances
     state = state_from(values, state, pairs)
     steps = {name: value - made_at.get(name, 0.0) for name, value in state.nuisances.items()}
-    unknowns, motion = eliminated.unknowns, _Motion(values, eliminated.twist_responses(), steps)
+    unknowns, motion = system.unknowns, _Motion(values, system.twist_responses(), steps)
     blocks, roots, residuals, curvatures, sides, level = [], [], [], [], [], []
     for pair in pairs:
         for c, matches in pair.matches.items():

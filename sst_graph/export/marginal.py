@@ -19,6 +19,7 @@ from sst_graph.errors import EstimationError, count_of, first_line
 from sst_graph.export.agreement import SIGNIFICANCE, check_agreement, check_apart
 from sst_graph.factors.arguments import checked_several, checked_type, described
 from sst_graph.factors.errors import FactorError
+from sst_graph.graph.linear import ordering_of
 from sst_graph.inspect.considered import considered_errors
 from sst_graph.marginal import (
     EXTRINSIC,
@@ -126,10 +127,8 @@ def marginal_of_graph(
     try:
         linear = graph.linearize(values)
         keys = list(linear.keyVector())
-        ordering = gtsam.Ordering()
-        for key in sorted(keys, key=lambda key: (key != E_key, key != D_key, key)):
-            ordering.push_back(key)
-        augmented = linear.augmentedHessian(ordering)
+        first = sorted(keys, key=lambda key: (key != E_key, key != D_key, key))
+        augmented = linear.augmentedHessian(ordering_of(first))
     except (RuntimeError, ValueError) as error:
         raise EstimationError(f"graph: cannot be linearized and eliminated ({first_line(error)})") from error
     known = [*(range(6) if E_key in keys else ()), *((6,) if D_key in keys else ())]

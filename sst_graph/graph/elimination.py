@@ -1,20 +1,18 @@
-"""The unknowns that are not motion, with the motion of a frozen graph marginalised out."""
+"""The normal equations of a frozen problem, its motion to be eliminated.
+
+Each twist occurs in the matches of its own image and one measurement: no factor has two of them, and each is
+eliminated by itself (Schur complement).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
-import gtsam
 import numpy as np
 
-from sst_graph.graph.building import tracked_objects
-from sst_graph.graph.linear import scale_of, with_ridge
-from sst_graph.graph.matching import PairMatches
-from sst_graph.graph.state import EXTRINSIC, State, bias_key, nuisance_key, object_bias_key, time_offset_key
-from sst_graph.types import FloatArray, IntArray
+from sst_graph.graph.linear import information_inverse
+from sst_graph.types import FloatArray
 
 
 @dataclass(frozen=True)
@@ -23,14 +21,6 @@ class Unknowns:
     are estimated, the mask biases."""
 
     keys: tuple[int, ...]
-
-    @classmethod
-    def of(cls, state: State, pairs: Sequence[PairMatches]) -> Unknowns:
-        clocks = [time_offset_key(clock) for clock in range(len(state.time_offsets_s))]
-        names = dict.fromkeys(name for pair in pairs for own in pair.terms.values() for name in own)
-        biases = {bias_key(pair.drive, c) for pair in pairs for c in pair.matches}
-        objects = {object_bias_key(drive, track) for drive, _, track in tracked_objects(pairs)}
-        return cls((EXTRINSIC, *clocks, *map(nuisance_key, names), *sorted(biases), *sorted(objects)))
 
     @property
     def size(self) -> int:
@@ -44,145 +34,62 @@ class Unknowns:
         """First column of a key."""
         return self._places[key]
 
-    def columns(self, key: int) -> IntArray:
-        """All columns of a key: six of the extrinsic, one of every other."""
-        first = self._places[key]
-        return np.arange(first, first + (6 if first == 0 else 1))
-
 
 @dataclass(frozen=True)
-class Eliminated:
-    """A frozen graph, linear, whose motion is to be eliminated.
+class NormalEquations:
+    """The linearized problem, H x = -g with x over the extrinsic (right perturbation), scalars and twists.
 
     Attributes:
-        unknowns: that stay.
-        own: (n, n) information of the factors without motion.
-        groups: that of the others by groups of motion.
+        unknowns: all but the twists.
+        twists: keys of the twists.
+        cost: at the point.
+        H, g: (n, n), (n,) of all unknowns but the twists.
+        H_twists, g_twists: (f, 6, 6), (f, 6) of the twists; no factor has two of them.
+        H_mixed: (f, 6, n) of each twist with the others.
     """
 
     unknowns: Unknowns
-    own: FloatArray
-    groups: Sequence[_Group]
+    twists: tuple[int, ...]
+    cost: float
+    H: FloatArray
+    g: FloatArray
+    H_twists: FloatArray
+    g_twists: FloatArray
+    H_mixed: FloatArray
 
-    @classmethod
-    def of(cls, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, unknowns: Unknowns) -> Eliminated:
-        """The graph linearized at some values."""
-        return cls(unknowns, *_information(graph, values, unknowns))
+    def step(self, damping: float) -> tuple[FloatArray, FloatArray]:
+        """(n,) and (f, 6): the step with ``damping`` added to the diagonal of the whole H."""
+        inverse, H, g = self._reduced(damping)
+        x = np.asarray(-np.linalg.solve(H, g), np.float64)
+        followed = self.g_twists + self.H_mixed @ x
+        return x, -(inverse @ followed[:, :, None])[:, :, 0]
+
+    def step_along(self, unknown: int, length: float) -> tuple[FloatArray, FloatArray]:
+        """(n,) and (f, 6): the step that moves one unknown so far and lets all others follow."""
+        inverse, H, g = self._reduced(0.0)
+        x, rest = np.zeros(len(g)), np.arange(len(g)) != unknown
+        x[unknown] = length
+        x[rest] = -np.linalg.solve(H[np.ix_(rest, rest)], g[rest] + H[rest, unknown] * length)
+        followed = self.g_twists + self.H_mixed @ x
+        return x, -(inverse @ followed[:, :, None])[:, :, 0]
 
     def covariance(self) -> FloatArray:
-        """(n, n) covariance of the unknowns with the motion marginalised out.
+        """(n, n) of all unknowns but the twists.
 
-        By a scaled Schur complement, for gtsam.Marginals gives up at condition numbers near 1e9, which metres
-        and pixels in one matrix reach although every direction is observable. Twists that no factor ties to
-        one another are eliminated one after the other: a dense Hessian of a long drive would take a gigabyte.
+        gtsam.Marginals gives up at condition numbers near 1e9, which metres and pixels in one matrix reach
+        although every direction is observable.
         """
-        own = self.own
-        # Scaled to a unit diagonal, that of the motion too.
-        diagonal = np.diag(own).copy()
-        for group in self.groups:
-            diagonal[group.columns] += np.diag(group.information)[: len(group.columns)]
-        scale = scale_of(diagonal)
-        schur = with_ridge(own * np.outer(scale, scale))
-        for columns, information, _ in self.groups:
-            m = len(columns)
-            scales = np.concatenate([scale[columns], scale_of(np.diag(information)[m:])])
-            H = information * np.outer(scales, scales)
-            inner = with_ridge(H[m:, m:])
-            schur[np.ix_(columns, columns)] += H[:m, :m] - H[:m, m:] @ np.linalg.solve(inner, H[m:, :m])
-        return np.asarray(np.linalg.inv(schur) * np.outer(scale, scale))
+        return information_inverse(self._reduced(0.0)[1])
 
     def twist_responses(self) -> dict[int, FloatArray]:
         """(6, n) derivative of the optimum of each twist by the unknowns, by the twist's key."""
-        found = {}
-        for group in self.groups:
-            m = len(group.columns)
-            for at, key in zip(range(m, len(group.information), 6), group.motion, strict=True):
-                rows = group.information[at : at + 6]
-                response = np.zeros((6, self.unknowns.size))
-                response[:, group.columns] = -np.linalg.solve(rows[:, at : at + 6], rows[:, :m])
-                found[key] = response
-        return found
+        return dict(zip(self.twists, -np.linalg.solve(self.H_twists, self.H_mixed), strict=True))
 
-
-def marginal_covariance(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, unknowns: Unknowns
-) -> FloatArray:
-    """:meth:`Eliminated.covariance` of a graph."""
-    return Eliminated.of(graph, values, unknowns).covariance()
-
-
-class _Group(NamedTuple):
-    """Motion that factors tie together, such as one twist.
-
-    Attributes:
-        columns: (m,) unknowns that these factors touch as well.
-        information: (m + k, m + k) of these factors, over the columns and the motion.
-        motion: keys of the motion.
-    """
-
-    columns: IntArray
-    information: FloatArray
-    motion: tuple[int, ...]
-
-
-def _information(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, unknowns: Unknowns
-) -> tuple[FloatArray, list[_Group]]:
-    """(n, n) information of the factors without motion, and that of the others by groups of motion."""
-    linear, known = graph.linearize(values), set(unknowns.keys)
-    own = np.zeros((unknowns.size, unknowns.size))
-    together = _Together()
-    terms: list[tuple[list[int], FloatArray]] = []
-    for i in range(linear.size()):
-        factor = linear.at(i)
-        keys, information = list(factor.keys()), np.asarray(factor.information())
-        moving = [key for key in keys if key not in known]
-        if moving:
-            together.join(moving)
-            terms.append((keys, information))
-        else:
-            columns = np.concatenate([unknowns.columns(key) for key in keys])
-            own[np.ix_(columns, columns)] += information
-    by_group: dict[int, list[tuple[list[int], FloatArray]]] = {}
-    for keys, information in terms:
-        first = next(key for key in keys if key not in known)
-        by_group.setdefault(together.root(first), []).append((keys, information))
-    sizes = values.zeroVectors()
-    return own, [_group(parts, unknowns, sizes) for parts in by_group.values()]
-
-
-def _group(
-    parts: Sequence[tuple[list[int], FloatArray]], unknowns: Unknowns, sizes: gtsam.VectorValues
-) -> _Group:
-    """The sum of some factors' information."""
-    known = set(unknowns.keys)
-    motion = sorted({key for keys, _ in parts for key in keys if key not in known})
-    touched = sorted({key for keys, _ in parts for key in keys if key in known}, key=unknowns.column)
-    columns = np.concatenate([np.zeros(0, np.intp), *map(unknowns.columns, touched)])
-    place = {key: np.searchsorted(columns, unknowns.columns(key)) for key in touched}
-    end = len(columns)
-    for key in motion:
-        place[key] = np.arange(end, end + len(sizes.at(key)))
-        end += len(place[key])
-    information = np.zeros((end, end))
-    for keys, part in parts:
-        at = np.concatenate([place[key] for key in keys])
-        information[np.ix_(at, at)] += part
-    return _Group(columns, information, tuple(motion))
-
-
-class _Together:
-    """Keys that belong to the same group (union and find)."""
-
-    def __init__(self) -> None:
-        self._above: dict[int, int] = {}
-
-    def root(self, key: int) -> int:
-        while (above := self._above.setdefault(key, key)) != key:
-            self._above[key] = key = self._above[above]
-        return key
-
-    def join(self, keys: Sequence[int]) -> None:
-        first = self.root(keys[0])
-        for key in keys[1:]:
-            self._above[self.root(key)] = first
+    def _reduced(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Inverse of the twists' blocks, and H and g with the twists eliminated."""
+        inverse = np.asarray(np.linalg.inv(self.H_twists + damping * np.eye(6)), np.float64)
+        n = len(self.g)
+        mixed = self.H_mixed.reshape(-1, n)
+        H = self.H + damping * np.eye(n) - mixed.T @ (inverse @ self.H_mixed).reshape(-1, n)
+        g = self.g - mixed.T @ (inverse @ self.g_twists[:, :, None]).reshape(-1)
+        return inverse, H, g

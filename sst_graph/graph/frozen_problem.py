@@ -2,10 +2,9 @@
 
 The factors are the same, and so are their formulas (:func:`sst_graph.factors.reprojection.evaluate`,
 :func:`sst_graph.factors.velocity.transferred`), but those of all images are evaluated at once: with
-the few hundred matches of one image, the calls would cost more than the work. Each twist occurs in the
-matches of its own image and one measurement, so it is eliminated there (Schur complement), and what remains
-is a small dense system in the extrinsic, the clocks, the parameters of assumptions and the mask biases. Their
-priors are a gtsam graph.
+the few hundred matches of one image, the calls would cost more than the work. The twists are eliminated
+(:mod:`sst_graph.graph.elimination`), and what remains is a small dense system in the extrinsic, the clocks,
+the parameters of assumptions and the mask biases. Their priors are a gtsam graph.
 """
 
 from __future__ import annotations
@@ -23,8 +22,9 @@ from sst_graph.factors.matches import Alignment
 from sst_graph.factors.reprojection import Evaluated, ImageGroups, weigh
 from sst_graph.factors.velocity import transferred
 from sst_graph.graph.building import UNKNOWN_TWIST_SIGMAS, prior_graph
+from sst_graph.graph.elimination import NormalEquations, Unknowns
 from sst_graph.graph.known import KnownCalibration
-from sst_graph.graph.linear import information_inverse
+from sst_graph.graph.linear import ordering_of
 from sst_graph.graph.matching import DriveMatches, GraphConfig
 from sst_graph.graph.state import (
     EXTRINSIC,
@@ -56,54 +56,6 @@ class FrozenPoint:
     cTl: gtsam.Pose3
     scalars: FloatArray
     twists: FloatArray
-
-
-@dataclass(frozen=True)
-class NormalEquations:
-    """The linearized problem, H x = -g with x over the extrinsic (right perturbation), scalars and twists.
-
-    Attributes:
-        cost: at the point.
-        H, g: (n, n), (n,) of all unknowns but the twists.
-        H_twists, g_twists: (f, 6, 6), (f, 6) of the twists; no factor has two of them.
-        H_mixed: (f, 6, n) of each twist with the others.
-    """
-
-    cost: float
-    H: FloatArray
-    g: FloatArray
-    H_twists: FloatArray
-    g_twists: FloatArray
-    H_mixed: FloatArray
-
-    def step(self, damping: float) -> tuple[FloatArray, FloatArray]:
-        """(n,) and (f, 6): the step with ``damping`` added to the diagonal of the whole H."""
-        inverse, H, g = self._reduced(damping)
-        x = np.asarray(-np.linalg.solve(H, g), np.float64)
-        followed = self.g_twists + self.H_mixed @ x
-        return x, -(inverse @ followed[:, :, None])[:, :, 0]
-
-    def step_along(self, unknown: int, length: float) -> tuple[FloatArray, FloatArray]:
-        """(n,) and (f, 6): the step that moves one unknown so far and lets all others follow."""
-        inverse, H, g = self._reduced(0.0)
-        x, rest = np.zeros(len(g)), np.arange(len(g)) != unknown
-        x[unknown] = length
-        x[rest] = -np.linalg.solve(H[np.ix_(rest, rest)], g[rest] + H[rest, unknown] * length)
-        followed = self.g_twists + self.H_mixed @ x
-        return x, -(inverse @ followed[:, :, None])[:, :, 0]
-
-    def covariance(self) -> FloatArray:
-        """(n, n) of all unknowns but the twists."""
-        return information_inverse(self._reduced(0.0)[1])
-
-    def _reduced(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Inverse of the twists' blocks, and H and g with the twists eliminated."""
-        inverse = np.asarray(np.linalg.inv(self.H_twists + damping * np.eye(6)), np.float64)
-        n = len(self.g)
-        mixed = self.H_mixed.reshape(-1, n)
-        H = self.H + damping * np.eye(n) - mixed.T @ (inverse @ self.H_mixed).reshape(-1, n)
-        g = self.g - mixed.T @ (inverse @ self.g_twists[:, :, None]).reshape(-1)
-        return inverse, H, g
 
 
 @dataclass(frozen=True)
@@ -229,11 +181,11 @@ class FrozenProblem:
         biases = [bias_key(drive, c) for drive, c in self._classes]
         biases += [object_bias_key(drive, track) for drive, _, track in self._objects]
         self._keys = (*clocks, *map(nuisance_key, self._names), *biases)
-        self._columns = {key: 6 + place for place, key in enumerate(self._keys)}
-        self._terms = [self._columns[nuisance_key(name)] for name in self._names]
-        self._shared = _ordered((EXTRINSIC, *self._keys))
+        self.unknowns = Unknowns((EXTRINSIC, *self._keys))
+        self._terms = [self.unknowns.column(nuisance_key(name)) for name in self._names]
+        self._shared = ordering_of(self.unknowns.keys)
         # 2. Images and matches.
-        self._images = _images(matches, state, self._columns)
+        self._images = _images(matches, state, self.unknowns)
         places = {key: number for number, key in enumerate(self._images.keys)}
         self._frames = [self._frames_of(own, places) for own in matches]
         scalars = [float(values.atVector(key)[0]) for key in self._keys]
@@ -242,7 +194,7 @@ class FrozenProblem:
     @property
     def ordering(self) -> gtsam.Ordering:
         """Order of all unknowns, as in the normal equations, the twists last."""
-        return _ordered((EXTRINSIC, *self._keys, *self._images.keys))
+        return ordering_of((*self.unknowns.keys, *self._images.keys))
 
     def optimum(self, iterations: int) -> tuple[FrozenPoint, NormalEquations]:
         """By at most so many Levenberg-Marquardt steps from the start; and the problem linearized there."""
@@ -303,6 +255,8 @@ class FrozenProblem:
         H, b = self._priors.linearize(values).hessian(self._shared)
         count, n = len(self._images.keys), len(H)
         system = NormalEquations(
+            self.unknowns,
+            self._images.keys,
             self._priors.error(values),
             np.array(H),
             -np.asarray(b).reshape(-1),
@@ -392,37 +346,31 @@ class FrozenProblem:
         number = matches.number
         pairs = [twist_key(number, pair.image) for pair in matches.pairs]
         images = np.array([places.get(key, -1) for key in pairs])[matches.pair_of]
-        biases = _bias_columns(matches, self._columns)
+        biases = _bias_columns(matches, self.unknowns)
         order = np.lexsort((biases, images))
         terms = (
             np.stack([matches.terms[name] for name in self._names])
             if self._names
             else np.zeros((0, len(order)))
         )
-        clock = self._columns[time_offset_key(self.state.clock(number))]
+        clock = self.unknowns.column(time_offset_key(self.state.clock(number)))
         terms_at = np.array([self.state.nuisances.get(name, 0.0) for name in self._names])
         alignment, images, biases = matches.alignment.take(order), images[order], biases[order]
         return _Frames(alignment, images, biases, clock, self._terms, terms[:, order], terms_at)
 
 
-def _ordered(keys: Sequence[int]) -> gtsam.Ordering:
-    ordering = gtsam.Ordering()
-    for key in keys:
-        ordering.push_back(key)
-    return ordering
-
-
-def _bias_columns(matches: DriveMatches, columns: dict[int, int]) -> IntArray:
+def _bias_columns(matches: DriveMatches, unknowns: Unknowns) -> IntArray:
     """(m,) column of the mask bias of each match."""
     number = matches.number
     if matches.tracks is None:
-        of_groups = [columns[bias_key(number, c)] for c in matches.group_classes]
+        of_groups = [unknowns.column(bias_key(number, c)) for c in matches.group_classes]
         return np.repeat(of_groups, matches.counts)
     tracks, which = np.unique(matches.tracks, return_inverse=True)
-    return np.array([columns[object_bias_key(number, track)] for track in tracks.tolist()])[which.reshape(-1)]
+    columns = [unknowns.column(object_bias_key(number, track)) for track in tracks.tolist()]
+    return np.array(columns)[which.reshape(-1)]
 
 
-def _images(matches: Sequence[DriveMatches], state: State, columns: dict[int, int]) -> _Images:
+def _images(matches: Sequence[DriveMatches], state: State, unknowns: Unknowns) -> _Images:
     """The images that have matches, drive by drive."""
     parts = []
     for own in matches:
@@ -431,7 +379,7 @@ def _images(matches: Sequence[DriveMatches], state: State, columns: dict[int, in
         for p in own.paired:
             first.setdefault(own.pairs[p].image, p)
         pairs, k = list(first.values()), len(first)
-        samples, clock = own.motions.l_twists, columns[time_offset_key(state.clock(own.number))]
+        samples, clock = own.motions.l_twists, unknowns.column(time_offset_key(state.clock(own.number)))
         if samples is None:
             l_twists = l_accelerations = np.zeros((k, 6))
             information = np.tile(np.diag(UNKNOWN_TWIST_SIGMAS**-2.0), (k, 1, 1))

@@ -7,7 +7,7 @@ no direction is unobservable; scaled, it is small.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import combinations, groupby
 
 import gtsam
@@ -90,6 +90,14 @@ def quadratic_factor(
             )
         )
     return gtsam.LinearContainerFactor(gtsam.HessianFactor(pieces), point)
+
+
+def ordering_of(keys: Iterable[int]) -> gtsam.Ordering:
+    """Keys in an order, as gtsam takes it."""
+    ordering = gtsam.Ordering()
+    for key in keys:
+        ordering.push_back(key)
+    return ordering
 
 
 def scattered(n: int, places: Sequence[IntArray], *blocks: Sequence[FloatArray]) -> list[FloatArray]:

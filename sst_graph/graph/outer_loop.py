@@ -25,6 +25,7 @@ from sst_graph.factors.robust import RobustKernel
 from sst_graph.fit import OuterIteration
 from sst_graph.graph.building import joint_graph
 from sst_graph.graph.drive_motion import DriveMotion, motions_of
+from sst_graph.graph.elimination import NormalEquations
 from sst_graph.graph.frozen_problem import FrozenPoint, FrozenProblem
 from sst_graph.graph.known import KnownCalibration
 from sst_graph.graph.matching import (
@@ -165,11 +166,7 @@ class JointSolution:
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """The last frozen problem as a graph. Many solutions are compared by their states alone: it is made
         where it is asked for."""
-        return self.graph_of(self.pairs)
-
-    def graph_of(self, pairs: Sequence[PairMatches]) -> gtsam.NonlinearFactorGraph:
-        """The last frozen problem with other matches as a graph."""
-        graph, _ = joint_graph(pairs, self.frozen.state, self.problem.config.graph, self.centre)
+        graph, _ = joint_graph(self.pairs, self.frozen.state, self.problem.config.graph, self.centre)
         if self.problem.prior is not None:
             graph.add(self.problem.prior.factor([*self.state.nuisances]))
         return graph
@@ -183,6 +180,11 @@ class JointSolution:
     def values(self) -> gtsam.Values:
         """The unknowns at the optimum of the last frozen problem."""
         return self.frozen.values_at(self.optimum)
+
+    @cached_property
+    def system(self) -> NormalEquations:
+        """The last frozen problem, linear at its optimum."""
+        return self.frozen.linearized(self.optimum)
 
 
 def step_share(steps: int) -> float:

@@ -18,6 +18,7 @@ from sst_graph.drive.path import SensorPath
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import EstimationError, count_of
 from sst_graph.fit import OuterIteration
+from sst_graph.graph.linear import ordering_of
 from sst_graph.graph.outer_loop import STEP_SIGMAS, step_share
 from sst_graph.graph.state import EXTRINSIC, State, difference, time_offset_key
 from sst_graph.hand_eye.covariance import hand_eye_covariance
@@ -211,9 +212,7 @@ def _optimise(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.
 
 def _information(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> FloatArray:
     """(7, 7) of [E, D]."""
-    ordering = gtsam.Ordering()
-    ordering.push_back(EXTRINSIC)
-    ordering.push_back(time_offset_key())
+    ordering = ordering_of((EXTRINSIC, time_offset_key()))
     return np.asarray(graph.linearize(values).hessian(ordering)[0])
 
 

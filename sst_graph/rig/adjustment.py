@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import gtsam
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from sst_graph.covariance.contradiction import Difference, name_step
 from sst_graph.factors import camera_pose_factor
 from sst_graph.factors.camera_pose import camera_pose_error
-from sst_graph.graph.linear import information_inverse
+from sst_graph.graph.linear import information_inverse, ordering_of
 from sst_graph.rig.known import TRIGGER_SIGMA_S, KnownPose, KnownRig
 from sst_graph.rig.marginal import RigMarginal
 from sst_graph.types import FloatArray
@@ -83,12 +84,8 @@ def adjusted(marginal: RigMarginal, known: KnownRig) -> RigMarginal:
     params = gtsam.LevenbergMarquardtParams()
     params.setlambdaInitial(1e-9)
     values = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
-    ordering = gtsam.Ordering()
     keys = [marginal.keys()[name] for name in marginal.names]
-    for E, D in keys:
-        ordering.push_back(E)
-        ordering.push_back(D)
-    information, _ = graph.linearize(values).hessian(ordering)
+    information, _ = graph.linearize(values).hessian(ordering_of(chain.from_iterable(keys)))
     return replace(
         marginal,
         extrinsics=tuple(values.atPose3(E) for E, _ in keys),

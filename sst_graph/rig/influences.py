@@ -22,7 +22,6 @@ from sst_graph.covariance.cluster_robust import RobustCovariance, steps_without_
 from sst_graph.covariance.error_model import by_side_and_frame
 from sst_graph.covariance.jackknife import ObjectSpread, bounded_ratio
 from sst_graph.factors.velocity import transferred
-from sst_graph.graph.elimination import Eliminated
 from sst_graph.graph.matching import PairMatches
 from sst_graph.graph.outer_loop import JointSolution
 from sst_graph.graph.state import EXTRINSIC, time_offset_key, twist_key
@@ -186,7 +185,7 @@ def _by_motion(robust: RobustCovariance, solution: JointSolution) -> tuple[IntAr
     """
     values, unknowns = solution.values, robust.unknowns
     cTl = values.atPose3(EXTRINSIC)
-    responses = Eliminated.of(solution.graph, values, unknowns).twist_responses()
+    responses = solution.system.twist_responses()
     back = np.asarray(solution.frozen.state.cTl.inverse().AdjointMap()).T
     found: dict[int, FloatArray] = {}
     seen: set[int] = set()

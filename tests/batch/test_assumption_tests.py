@@ -199,7 +199,7 @@ def test_the_linear_problem_agrees_with_a_solution_for_each_parameter(problem: S
     for name in ("k1", "skew"):
         start = dataclasses.replace(problem.solution.state, nuisances={name: 0.0})
         alone = problem.solve_with((name,), start, (10.0, 5.0, 4.0, 3.0), 12)
-        robust = robust_covariance(alone.graph, alone.values, alone.pairs, alone.state, problem.objects)
+        robust = robust_covariance(alone.system, alone.values, alone.pairs, alone.state, problem.objects)
         column = robust.unknowns.column(nuisance_key(name))
         sigma = np.sqrt(robust.matrix[column, column])
         few = few_objects_factor(int(robust.table.objects.max()) + 1, 3.3)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import gtsam
 import numpy as np
 import pytest
+from linear_systems import system_of, unknowns_of
 from scipy.sparse import csr_array
 
 from sst_graph.association.edge_matching import SIDES, TOP
@@ -21,7 +23,6 @@ from sst_graph.covariance.error_model import (
 from sst_graph.covariance.level_edges import LevelEdges, shares_that_stay
 from sst_graph.covariance.match_table import MatchTable
 from sst_graph.covariance.sums import ScoreSums, gram, total
-from sst_graph.graph.elimination import Unknowns, marginal_covariance
 from sst_graph.graph.state import EXTRINSIC, bias_key, time_offset_key, twist_key
 from sst_graph.types import SemanticClass
 
@@ -200,7 +201,7 @@ def test_spread_beyond() -> None:
     assert spread_beyond(means[:5], variances[:5], np.arange(5)) == 0.0
 
 
-def small_graph() -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, Unknowns]:
+def small_graph() -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     """Linear ties between extrinsic, offset, a bias and two twists, with correlated noise."""
     rng = np.random.default_rng(5)
     twists = {twist_key(0, 3): 6, twist_key(0, 7): 6}
@@ -210,34 +211,37 @@ def small_graph() -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, Unknowns]:
     for key in list(keys)[1:]:
         values.insert(key, rng.normal(size=keys[key]))
     for _ in range(6):
-        blocks = [(key, rng.normal(size=(4, dim))) for key, dim in keys.items()]
-        terms = [item for block in blocks for item in block]
-        # JacobianFactors take three keys at most: tie them two at a time.
-        for k in range(0, len(terms) - 2, 2):
+        # JacobianFactors take three keys at most: tie them two at a time, the twists to the others alone.
+        *others, V, W = [[key, rng.normal(size=(4, dim))] for key, dim in keys.items()]
+        for one, other in [*pairwise(others), (others[-1], V), (others[0], W)]:
             noise = gtsam.noiseModel.Isotropic.Sigma(4, rng.uniform(0.5, 2.0))
-            linear = gtsam.JacobianFactor(
-                *terms[k : k + 4],
-                rng.normal(size=4),
-                noise,
-            )
+            linear = gtsam.JacobianFactor(*one, *other, rng.normal(size=4), noise)
             graph.add(gtsam.LinearContainerFactor(linear, values))
     for key, dim in keys.items():
         prior = gtsam.JacobianFactor(
             key, np.eye(dim), np.zeros(dim), gtsam.noiseModel.Isotropic.Sigma(dim, 3.0)
         )
         graph.add(gtsam.LinearContainerFactor(prior, values))
-    return graph, values, Unknowns((EXTRINSIC, time_offset_key(), bias_key(0, VEHICLE)))
+    return graph, values
 
 
 def test_marginals_are_gtsams() -> None:
-    graph, values, unknowns = small_graph()
-    found = marginal_covariance(graph, values, unknowns)
+    graph, values = small_graph()
+    system = system_of(graph, values)
+    found, unknowns = system.covariance(), system.unknowns
     joint = gtsam.Marginals(graph, values).jointMarginalCovariance(list(unknowns.keys))
     expected = np.block([[joint.at(a, b) for b in unknowns.keys] for a in unknowns.keys])
     assert found.shape == (8, 8) == (unknowns.size, unknowns.size)
     np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-10)
+    # How a twist follows the others: its covariance with them over theirs.
+    responses = system.twist_responses()
+    assert set(responses) == {twist_key(0, 3), twist_key(0, 7)}
+    for V, response in responses.items():
+        both = gtsam.Marginals(graph, values).jointMarginalCovariance([V, *unknowns.keys])
+        cross = np.hstack([both.at(V, key) for key in unknowns.keys])
+        np.testing.assert_allclose(response @ expected, cross, rtol=1e-8, atol=1e-10)
 
 
 def test_columns_of_the_unknowns() -> None:
-    _, _, unknowns = small_graph()
+    unknowns = unknowns_of(small_graph()[0])
     assert [unknowns.column(key) for key in unknowns.keys] == [0, 6, 7]

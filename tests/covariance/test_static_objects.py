@@ -6,6 +6,7 @@ import dataclasses
 
 import gtsam
 import numpy as np
+from linear_systems import system_of
 from streets import prepared_street, standing_street
 
 from sst_graph.batch import CalibrationConfig
@@ -33,7 +34,7 @@ def matched() -> tuple[State, list[PairMatches], dict[ObjectId, int]]:
 
 def robust_of(pairs: list[PairMatches], state: State, tracks: dict[ObjectId, int]) -> RobustCovariance:
     graph, values = joint_graph(pairs, state, CONFIG)
-    return robust_covariance(graph, values, pairs, state, [tracks])
+    return robust_covariance(system_of(graph, values), values, pairs, state, [tracks])
 
 
 def of_track(pair: PairMatches, track: int) -> np.ndarray:

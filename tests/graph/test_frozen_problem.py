@@ -8,6 +8,7 @@ from functools import cache
 import gtsam
 import numpy as np
 import pytest
+from linear_systems import system_of
 from streets import prepared_street, standing_street
 
 from sst_graph.covariance.cluster_robust import robust_covariance
@@ -164,7 +165,7 @@ def test_several_images_of_a_scan_are_matched_each_by_itself() -> None:
     H, _ = whole(problem.linearized(problem.start))
     expected, _ = graph.linearize(values).hessian(problem.ordering)
     np.testing.assert_allclose(H, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
-    robust = robust_covariance(graph, values, together, state, [objects])
+    robust = robust_covariance(system_of(graph, values), values, together, state, [objects])
     assert sorted(set(robust.table.frames.tolist())) == [0, 1, 2]
     # Without the setting, or at equal rates, a scan has its nearest image alone.
     nearest = associate([drive], motions, state, KERNEL, PLAIN)

@@ -7,6 +7,7 @@ from functools import cache
 import gtsam
 import numpy as np
 import pytest
+from linear_systems import system_of, unknowns_of
 from stored import simulated
 
 from sst_graph.covariance.cluster_robust import covariance_of, robust_covariance
@@ -16,7 +17,6 @@ from sst_graph.drive.preparation import Drive, PrepareConfig, prepare_drive
 from sst_graph.factors import RobustKernel
 from sst_graph.graph.building import PRIOR_ROTATION_SIGMA_RAD, PRIOR_TRANSLATION_SIGMA_M, joint_graph
 from sst_graph.graph.drive_motion import motions_of
-from sst_graph.graph.elimination import Eliminated, Unknowns
 from sst_graph.graph.matching import GraphConfig, PairMatches, associate
 from sst_graph.graph.state import State
 from sst_graph.inspect.frame_gains import frame_gains
@@ -57,7 +57,7 @@ def optimum(motion: str) -> gtsam.Values:
 def gains(motion: str) -> tuple[ErrorModel, tuple[FrameInformation, ...]]:
     drive, state, pairs, objects = matched(motion)
     graph, _ = joint_graph(pairs, state, CONFIG)
-    robust = robust_covariance(graph, optimum(motion), pairs, state, objects)
+    robust = robust_covariance(system_of(graph, optimum(motion)), optimum(motion), pairs, state, objects)
     return robust.model, frame_gains(graph, optimum(motion), pairs, state, [drive], robust)
 
 
@@ -67,9 +67,8 @@ def frozen(motion: str, positions: list[int]) -> tuple[gtsam.NonlinearFactorGrap
     some = [pairs[k] for k in positions]
     graph, _ = joint_graph(some, state, CONFIG)
     values = values_of(motion, graph)
-    unknowns = Unknowns.of(state, some)
-    eliminated = Eliminated.of(graph, values, unknowns)
-    return graph, eliminated.covariance(), match_table(eliminated, values, some, state, objects)
+    system = system_of(graph, values)
+    return graph, system.covariance(), match_table(system, values, some, state, objects)
 
 
 def values_of(motion: str, graph: gtsam.NonlinearFactorGraph) -> gtsam.Values:
@@ -90,11 +89,9 @@ def covariance_by_model(motion: str, positions: list[int]) -> np.ndarray:
 def claimed(motion: str, positions: list[int]) -> np.ndarray:
     """(7, 7) covariance that a calibration from some of the frames claims at its own optimum, one
     Gauss-Newton step away."""
-    _, state, pairs, _ = matched(motion)
     graph, bread, table = frozen(motion, positions)
     step = graph.linearize(values_of(motion, graph)).optimize()
-    unknowns = Unknowns.of(state, [pairs[k] for k in positions])
-    table = table.after(np.concatenate([step.at(key) for key in unknowns.keys]))
+    table = table.after(np.concatenate([step.at(key) for key in unknowns_of(graph).keys]))
     return covariance_of(bread, table, fit_error_model(table.residuals))[:7, :7]
 
 
@@ -128,9 +125,8 @@ def test_a_view_is_the_frame_alone(motion: str) -> None:
 
 def test_the_offset_follows_from_the_twist() -> None:
     _, state, pairs, objects = matched("constant")
-    unknowns = Unknowns.of(state, pairs)
     graph, values = joint_graph(pairs, state, CONFIG)
-    table = match_table(Eliminated.of(graph, values, unknowns), values, pairs, state, objects)
+    table = match_table(system_of(graph, values), values, pairs, state, objects)
     start = 0
     for pair, frame in zip(pairs, gains("constant")[1], strict=True):
         J = table.J[start : start + len(pair)].toarray()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 import pytest
+from linear_systems import system_of
 from scipy.stats import spearmanr
 from stored import simulated
 
@@ -49,7 +50,7 @@ def test_bits_and_sigmas_agree_with_leaving_the_frame_out() -> None:
     motions, truth = motions_of([drive], objects), State(source.truth.cTl, (0.05,))
     solution = solve_joint(JointProblem([drive], motions, config), truth)
     frozen = solution.graph, solution.values, solution.pairs, solution.state
-    robust = robust_covariance(*frozen, objects)
+    robust = robust_covariance(solution.system, *frozen[1:], objects)
     frames = frame_gains(*frozen, [drive], robust)
     kernel = RobustKernel("geman_mcclure", KERNELS_PX[-1])
     steps = gtsam.GaussNewtonParams()
@@ -61,7 +62,7 @@ def test_bits_and_sigmas_agree_with_leaving_the_frame_out() -> None:
         graph, values = joint_graph(pairs, solution.state, config.graph, truth)
         values = gtsam.GaussNewtonOptimizer(graph, values, steps).optimize()
         state = state_from(values, solution.state, pairs)
-        return robust_covariance(graph, values, pairs, state, objects).matrix[:7, :7]
+        return robust_covariance(system_of(graph, values), values, pairs, state, objects).matrix[:7, :7]
 
     full = calibrated(again)
     claimed, found, ratios = [], [], []

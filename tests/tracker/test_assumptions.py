@@ -8,6 +8,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from linear_systems import system_of
 from numpy.typing import NDArray
 from stored import simulated
 from streets import TRACKED_STREET
@@ -125,7 +126,7 @@ def test_what_the_tracker_considers_is_what_the_batch_does(optimized: Tracker) -
     )
     graph, values = joint_graph(pairs, state, optimized.matcher.graph, guess)
     robust = robust_covariance(
-        graph, values, pairs, state, [optimized.inputs.window.objects_of(list(entries))[0]]
+        system_of(graph, values), values, pairs, state, [optimized.inputs.window.objects_of(list(entries))[0]]
     )
     plain = considered_by_matches(
         robust, pairs, values, state, optimized.setup.config.calibration.assumptions
@@ -278,7 +279,7 @@ def test_what_is_estimated_agrees_with_the_batch(
     )
     start = State(distorted.truth.cTl, (0.03,))
     solution = solve_joint(JointProblem([drive], motions_of([drive], [tracks]), joint), start)
-    robust = robust_covariance(solution.graph, solution.values, solution.pairs, solution.state, [tracks])
+    robust = robust_covariance(solution.system, solution.values, solution.pairs, solution.state, [tracks])
     state, column = solution.state, robust.unknowns.column(nuisance_key("k1"))
     turn = gtsam.Pose3.Logmap(update.T_camera_lidar.between(state.cTl))
     step = np.array([*turn, state.time_offset_s(0) - update.time_offset_s, state.nuisances["k1"] - value])

@@ -82,7 +82,7 @@ def test_the_tracker_ends_where_the_batch_does(by_object: bool) -> None:
     matched = {track for _, _, track in tracked_objects(solution.pairs)} - {shared}
     theirs = {track: state.object_biases_px[0, track] for track in matched}
     assert len(theirs) > 5 and {track: ours[track] for track in theirs} == pytest.approx(theirs, abs=0.2)
-    robust = robust_covariance(solution.graph, solution.values, solution.pairs, state, [tracks])
+    robust = robust_covariance(solution.system, solution.values, solution.pairs, state, [tracks])
     expected = robust.matrix
     ratio = np.sqrt(np.diag(tracker.estimate.covariance)[:7] / np.diag(expected)[:7])
     np.testing.assert_allclose(ratio, 1.0, atol=0.2)  # leaving an object out may hang on few matches

@@ -8,6 +8,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from linear_systems import system_of
 from streets import EARLY_START, saved_tracker, sigmas_apart, tracker_from_truth
 
 from sst_graph import Tracker
@@ -66,7 +67,7 @@ def test_the_covariance_is_the_batch_s(running: Path) -> None:
     graph, values = joint_graph(pairs, state, config)
     values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     state = state_from(values, state, pairs)
-    robust = robust_covariance(graph, values, pairs, state, [tracks])
+    robust = robust_covariance(system_of(graph, values), values, pairs, state, [tracks])
     shifts = image_shifts(robust, pairs, values, state)
     assert shifts.sigmas.any()
     expected = robust.matrix[:7, :7] + shifts.covariance

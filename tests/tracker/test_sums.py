@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from linear_systems import system_of
 from numpy.typing import NDArray
 from stored import simulated
 
@@ -52,7 +53,7 @@ def matched() -> tuple[RobustCovariance, list[PairMatches], Point, list[Lineariz
     kernel = RobustKernel("geman_mcclure", 3.0)
     pairs = associate([drive], motions_of([drive], [tracks]), state, kernel, CONFIG)
     graph, values = joint_graph(pairs, state, CONFIG)
-    robust = robust_covariance(graph, values, pairs, state, [tracks])
+    robust = robust_covariance(system_of(graph, values), values, pairs, state, [tracks])
     seen = {t: 0 for pair in pairs for t in pair.tracks[VEHICLE].tolist()}
     point = Point.unbiased(state.cTl, OFFSET_S, [VEHICLE]).seen(seen)
     named = [{(c, n): track for (k, c, n), track in tracks.items() if k == pair.pair.scan} for pair in pairs]

@@ -158,6 +158,6 @@ def fit_of_edges(
     profiles: Sequence[Profile] = ()
     if calibration.config.for_report:
         edges = calibration.fit_of_drives.edges
-        frozen = solution.frozen.linearized(solution.optimum).covariance()[:7, :7]
+        frozen = solution.system.covariance()[:7, :7]
         profiles = score_profiles(edges, solution.state, frozen, np.sqrt(np.diag(covariance)))
     return calibration.fit_at(solution.state, iterations, profiles)
