@@ -11,7 +11,7 @@ from stored import simulated, stored
 
 from sst_graph.batch import CalibrationConfig
 from sst_graph.batch.by_edges.method import fit_of_edges
-from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX
+from sst_graph.batch.by_edges.optimum import NEAR_KERNELS_PX
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.batch.method_estimate import Guess
 from sst_graph.batch.problem import CalibrationProblem

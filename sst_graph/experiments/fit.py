@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import gtsam
 import numpy as np
 
-from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX
+from sst_graph.batch.by_edges.optimum import NEAR_KERNELS_PX
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.problem import CalibrationProblem

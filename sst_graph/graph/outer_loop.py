@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -79,8 +80,9 @@ MIN_MATCHES = 30
 _MOSTLY, _UNKNOWN_MPS = 0.5, 1.0
 """Too few matches are said to be due to moving vehicles where more than this share of the outlines moves, at
 velocities that are off by more than this [m/s]."""
-_PAIRS_A_UNIT = 6
-"""Pairs of scan and image whose outer iteration costs one unit of work (:mod:`sst_graph.stepwise`)."""
+_PAIRS_A_UNIT, _EDGES_WORK = 6, 2
+"""Pairs of scan and image whose outer iteration costs one unit of work (:mod:`sst_graph.stepwise`), and how
+many times the work of one with contours one with edges of pictures is."""
 MIN_CONCENTRATION = 0.6
 """Least :func:`concentration` of a result: wrong poses stay below it."""
 
@@ -127,8 +129,14 @@ class JointProblem:
 
     def estimating(self, names: Sequence[str]) -> JointProblem:
         """The problem with the parameters of further assumptions as variables, their spans as priors."""
-        graph = self.config.graph
-        graph = replace(graph, estimate=(*graph.estimate, *names))
+        return self._with_graph(estimate=(*self.config.graph.estimate, *names))
+
+    def at_peaks(self) -> JointProblem:
+        """The problem with points matched to the peaks of the picture's edges, to which few steps lead."""
+        return self._with_graph(edge_place="peak")
+
+    def _with_graph(self, **settings: Any) -> JointProblem:
+        graph = replace(self.config.graph, **settings)
         return replace(self, config=replace(self.config, graph=graph))
 
 
@@ -227,6 +235,7 @@ def solve_joint_steps(
     config, state, converged, outer = problem.config, start, False, 0
     centre = start if problem.centre is None else problem.centre
     edges = edges_of(problem.drives, problem.motions, config.graph)
+    unit = _EDGES_WORK if _by_edges(edges) else 1
     iterations = []
     for outer in range(config.max_outer):
         # 1. Matches at the current estimate, under a kernel that narrows.
@@ -245,7 +254,7 @@ def solve_joint_steps(
         iterations.append(OuterIteration(**vars(state.calibration()), kernel_px=scale, matches=count))
         if progress is not None:
             progress("solve", outer + 1, config.max_outer)
-        yield 1 + pairs // _PAIRS_A_UNIT
+        yield unit * (1 + pairs // _PAIRS_A_UNIT)
         # 4. Stop when the step is small at the last scale.
         if at_last >= 0:
             step = frozen.step_sigmas(optimum, system)
@@ -377,8 +386,7 @@ def _check_matches(matches: int, pairs: int, config: JointConfig, edges: Sequenc
     if matches >= config.min_matches:
         return
     expected = f"expected {config.min_matches} or more"
-    by_edges = {c for own in edges for c in own.classes} <= {SemanticClass.OBJECT}
-    moving = _moving_share(edges)
+    by_edges, moving = _by_edges(edges), _moving_share(edges)
     if moving > _MOSTLY:
         cause = (
             f"; {100.0 * moving:.0f} % of the outlines are those of vehicles that move, at velocities which "
@@ -396,6 +404,11 @@ def _check_matches(matches: int, pairs: int, config: JointConfig, edges: Sequenc
     where = f"{count_of(matches, kind, f'{kind}es')} in {count_of(pairs, 'pair')} of scan and image"
     where = where if matches else f"no {kind}es"
     raise EstimationError(f"{where}, {expected}{cause}")
+
+
+def _by_edges(edges: Sequence[DriveEdges]) -> bool:
+    """Whether edges of pictures are aligned, and no labels."""
+    return {c for own in edges for c in own.classes} <= {SemanticClass.OBJECT}
 
 
 def _moving_share(edges: Sequence[DriveEdges]) -> float:

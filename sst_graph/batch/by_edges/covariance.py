@@ -26,15 +26,15 @@ from sst_graph.batch.assumption_tests import (
     estimated_report,
     with_test_results,
 )
+from sst_graph.batch.by_edges.optimum import NEAR_KERNELS_PX
 from sst_graph.batch.by_edges.parts import thinned, with_objects, without_kind
 from sst_graph.batch.by_edges.positions import considered_positions
-from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX, solution_steps
 from sst_graph.batch.problem import JointEstimate
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.covariance.shared_errors import FEWEST, SharedErrors, spread_covariance, with_estimate
 from sst_graph.errors import EstimationError
 from sst_graph.features.lidar_edges import Edge
-from sst_graph.graph.outer_loop import JointProblem
+from sst_graph.graph.outer_loop import JointProblem, solve_joint_steps
 from sst_graph.graph.state import State, difference
 from sst_graph.objects.tracks import ObjectId
 from sst_graph.stepwise import Stepwise, run_to_end
@@ -180,7 +180,7 @@ def half_sample_steps(
         drives = [with_objects(*each, kept) for each in zip(some, objects, strict=True)]
         try:
             half = replace(problem, drives=drives)
-            part = yield from solution_steps(half, start, NEAR_KERNELS_PX, None, _STEP_SIGMAS)
+            part = yield from solve_joint_steps(half, start, NEAR_KERNELS_PX, None, _STEP_SIGMAS)
         except EstimationError:
             continue
         steps[number] = difference(start, part.state)
@@ -200,7 +200,7 @@ def outline_steps(problem: JointProblem, start: State) -> Stepwise[FloatArray | 
     drives = [without_kind(drive, Edge.SHALLOW_TOP) for drive in problem.drives]
     try:
         others = replace(problem, drives=drives)
-        part = yield from solution_steps(others, start, NEAR_KERNELS_PX, None, _STEP_SIGMAS)
+        part = yield from solve_joint_steps(others, start, NEAR_KERNELS_PX, None, _STEP_SIGMAS)
     except EstimationError:
         return None
     return difference(start, part.state)

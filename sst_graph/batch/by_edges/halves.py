@@ -17,11 +17,10 @@ from dataclasses import replace
 import numpy as np
 
 from sst_graph.batch.by_edges.covariance import SAMPLES
-from sst_graph.batch.by_edges.optimum import SCORE_PX, START_KERNELS_PX
+from sst_graph.batch.by_edges.optimum import NEAR_KERNELS_PX, SCORE_PX, START_KERNELS_PX
 from sst_graph.batch.by_edges.parts import thinned
 from sst_graph.batch.by_edges.problem import POINTS_A_SCAN
 from sst_graph.batch.by_edges.reasons import MIN_OVER_OTHER
-from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX
 from sst_graph.batch.contradictions import FALSE_ALARM, advice
 from sst_graph.covariance.contradiction import Difference, PartEstimate, name_step
 from sst_graph.edges.agreement import score

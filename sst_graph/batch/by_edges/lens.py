@@ -25,14 +25,13 @@ import numpy as np
 from sst_graph.assumptions import ASSUMPTIONS, named_sigmas
 from sst_graph.batch.assumption_tests import ParameterTest, few_objects_factor, with_further_tests
 from sst_graph.batch.by_edges.covariance import SAMPLES, half_sample_steps
-from sst_graph.batch.by_edges.optimum import START_KERNELS_PX
+from sst_graph.batch.by_edges.optimum import NEAR_KERNELS_PX, START_KERNELS_PX
 from sst_graph.batch.by_edges.problem import (
     EdgesProblem,
     LabelEstimate,
     edges_problem,
     problem_of_some_frames,
 )
-from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX, solution_steps
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.covariance.shared_errors import FEWEST
@@ -41,7 +40,7 @@ from sst_graph.errors import EstimationError
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.known import motion_steps
 from sst_graph.graph.matching import edges_of, match_all
-from sst_graph.graph.outer_loop import JointProblem, support_of
+from sst_graph.graph.outer_loop import JointProblem, solve_joint_steps, support_of
 from sst_graph.graph.state import State, difference, step_text
 from sst_graph.objects.tracks import ObjectId
 from sst_graph.stepwise import Stepwise, run_to_end
@@ -142,7 +141,7 @@ def lens_steps(
     # steps are enough: the later ones move the parameters by a fifth of a sigma.
     few = replace(free, config=replace(free.config, max_outer=len(START_KERNELS_PX)))
     try:
-        wide = yield from solution_steps(free if beside is None else few, start, START_KERNELS_PX)
+        wide = yield from solve_joint_steps(free if beside is None else few, start, START_KERNELS_PX)
         found = yield from _near(free, wide.state)
         met, expected = _support(free, found, start)
         if met < _LOST * expected:
@@ -186,11 +185,9 @@ def _with_these(edges: EdgesProblem, state: State, found: State, names: Sequence
 
 def _near(problem: JointProblem, start: State) -> Stepwise[State]:
     """The solution by near edges. Soft matches follow a wrong lens, so points are matched to the peaks of
-    their edges first, to which few steps lead."""
-    graph = replace(problem.config.graph, edge_place="peak")
-    by_peaks = replace(problem, config=replace(problem.config, graph=graph))
-    first = yield from solution_steps(by_peaks, start, NEAR_KERNELS_PX)
-    return (yield from solution_steps(problem, first.state, NEAR_KERNELS_PX)).state
+    their edges first."""
+    first = yield from solve_joint_steps(problem.at_peaks(), start, NEAR_KERNELS_PX)
+    return (yield from solve_joint_steps(problem, first.state, NEAR_KERNELS_PX)).state
 
 
 def _support(problem: JointProblem, *states: State) -> list[float]:

@@ -4,7 +4,6 @@ All of it in steps (:mod:`sst_graph.stepwise`): the tracker spreads them over fr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import gtsam
@@ -12,14 +11,13 @@ import numpy as np
 
 from sst_graph.batch.by_edges.problem import EdgesProblem
 from sst_graph.batch.by_edges.reasons import SCORE_WORK, unsettled_reasons
-from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX, WIDER_KERNEL_PX, solution_steps
 from sst_graph.drive.preparation import Progress
 from sst_graph.drive.stages import begin, stage
 from sst_graph.edges.agreement import score
 from sst_graph.edges.search import edge_starts_steps, turned
 from sst_graph.errors import EstimationError
 from sst_graph.graph.matching import edges_of
-from sst_graph.graph.outer_loop import JointProblem, JointSolution
+from sst_graph.graph.outer_loop import JointProblem, JointSolution, solve_joint_steps
 from sst_graph.graph.state import State, difference
 from sst_graph.stepwise import Stepwise
 from sst_graph.types import FloatArray
@@ -29,6 +27,11 @@ START_KERNELS_PX = (10.0, 8.0, 6.0, 5.0, 4.0, 3.0)
 KERNELS_PX = (*[5.0] * 6, *[4.0] * 3, *[3.0] * 3, *[2.0] * 2, 1.5, 1.2)
 """From the best of the starts, on all scans [px]. Pictures have edges beside the objects'; the last scale is
 below most of their distances. Then :data:`NEAR_KERNELS_PX` until nothing moves."""
+NEAR_KERNELS_PX = (3.0, 2.0, 2.0, 1.5, 1.2)
+"""From the estimate [px]: wide enough to meet other edges, too narrow to leave it."""
+WIDER_KERNEL_PX = (3.0,)
+"""Scale of the kernel under which an estimate is solved once more [px]: where it moves, it hangs on which of
+several edges nearby are met, and the step is a deviation of its covariance."""
 SCORE_PX = 1.5
 """Blur under which solutions are compared [px]."""
 _TURNS_DEG = np.array(
@@ -63,43 +66,23 @@ CONVERGED_STEP = np.array([*np.radians([0.02] * 3), 0.005, 0.005, 0.005, 0.003])
 """(7,) a round that moves by no more is the last [rad, m, s]."""
 
 
-def starts_steps(problem: EdgesProblem) -> Stepwise[list[State]]:
-    """Starts by the search, on the drive with most edges in view.
-
-    Raises:
-        EstimationError: none.
-    """
-    if not problem.subset_edges:
-        raise EstimationError("no LiDAR edge in any scan")
-    richest = max(problem.subset_edges, key=len)
-    found = yield from edge_starts_steps(richest, problem.region)
-    if not found:
-        raise EstimationError("no LiDAR edge in any picture")
-    return found
-
-
 def candidate_steps(problem: EdgesProblem) -> Stepwise[list[tuple[float, JointSolution]]]:
-    """Solutions on a few scans from the starts of the search, by their score, best first.
+    """Solutions on a few scans from the starts of a search on the drive with most edges in view, by their
+    score, best first.
 
     Raises:
         EstimationError: no start, or none leads anywhere.
     """
-    starts = yield from starts_steps(problem)
-    return (yield from refined_steps(problem, starts))
-
-
-def refined_steps(
-    problem: EdgesProblem, starts: Sequence[State]
-) -> Stepwise[list[tuple[float, JointSolution]]]:
-    """Solutions on a few scans, by their score, best first.
-
-    Raises:
-        EstimationError: none leads anywhere.
-    """
+    if not problem.subset_edges:
+        raise EstimationError("no LiDAR edge in any scan")
+    richest = max(problem.subset_edges, key=len)
+    starts = yield from edge_starts_steps(richest, problem.region)
+    if not starts:
+        raise EstimationError("no LiDAR edge in any picture")
     found, failures = [], []
     for start in starts:
         try:
-            solution = yield from solution_steps(problem.some, start, START_KERNELS_PX)
+            solution = yield from solve_joint_steps(problem.some, start, START_KERNELS_PX)
         except EstimationError as error:
             failures.append(error)
             continue
@@ -118,7 +101,7 @@ def best_optimum_steps(
     Raises:
         EstimationError: too few matches.
     """
-    wide = yield from solution_steps(problem.whole, start, KERNELS_PX, progress)
+    wide = yield from solve_joint_steps(problem.whole, start, KERNELS_PX, progress)
     best, best_score = yield from _newton_ascent(problem.whole, wide.state, progress)
     for _ in range(restarts):
         other = yield from _better_nearby(problem, best, progress)
@@ -195,12 +178,11 @@ def _newton_ascent(
 ) -> Stepwise[tuple[State, float]]:
     """A state near the optimum that a start leads to, and its score, by few long steps: each point is matched
     to the peak of its edge, which Newton's method says, until the score gains too little to count."""
-    graph = replace(problem.config.graph, edge_place="peak")
-    by_peaks = replace(problem, config=replace(problem.config, graph=graph))
-    edges = edges_of(problem.drives, problem.motions, graph)
+    by_peaks = problem.at_peaks()
+    edges = edges_of(problem.drives, problem.motions, by_peaks.config.graph)
     state, found_score = start, 0.0
     for _ in range(_MAX_ROUNDS):
-        solution = yield from solution_steps(by_peaks, state, NEAR_KERNELS_PX, progress)
+        solution = yield from solve_joint_steps(by_peaks, state, NEAR_KERNELS_PX, progress)
         state = solution.state
         before, found_score = found_score, score(edges, state, SCORE_PX)
         yield SCORE_WORK
@@ -217,7 +199,7 @@ def _converged(problem: JointProblem, start: State, progress: Progress | None) -
     """
     state = start
     for _ in range(_MAX_ROUNDS):
-        solution = yield from solution_steps(problem, state, NEAR_KERNELS_PX, progress)
+        solution = yield from solve_joint_steps(problem, state, NEAR_KERNELS_PX, progress)
         if (np.abs(difference(state, solution.state)) < CONVERGED_STEP).all():
             break
         state = solution.state
@@ -233,7 +215,7 @@ def farther_edges_steps(
     Raises:
         EstimationError: too few matches.
     """
-    wider = yield from solution_steps(problem, estimate, WIDER_KERNEL_PX)
+    wider = yield from solve_joint_steps(problem, estimate, WIDER_KERNEL_PX)
     step = difference(estimate, wider.state)
     if not unsettled_reasons(step):
         return step, ()

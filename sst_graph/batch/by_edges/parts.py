@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.drive.preparation import Drive, ScanFeatures, boundary_count
-from sst_graph.features.lidar_edges import Edge, with_points
+from sst_graph.features.lidar_edges import Boundaries, Edge, with_points
 from sst_graph.files.array_store import replaced
 from sst_graph.objects.tracks import ObjectId, numbers_in, of_each
 from sst_graph.sampling import spread_places, step_for
-from sst_graph.types import SemanticClass
+from sst_graph.types import BoolArray, SemanticClass
 
 
 def thinned(drive: Drive, most: int) -> Drive:
@@ -54,22 +54,27 @@ def _spread(drive: Drive, kept: NDArray[np.intp]) -> Drive:
     return replace(drive, scans=tuple(scans))
 
 
-def with_objects(drive: Drive, tracks: Mapping[ObjectId, int], kept: NDArray[np.bool_]) -> Drive:
+def with_objects(drive: Drive, tracks: Mapping[ObjectId, int], kept: BoolArray) -> Drive:
     """The drive with the boundary points of some groups of objects; tracks go round the groups."""
-    scans = []
-    for position, scan in enumerate(drive.scans):
-        boundaries = {}
-        for c, points in scan.boundaries.items():
-            numbers = {n: tracks[position, c, n] for n in numbers_in(points.objects)}
-            boundaries[c] = points.take(np.flatnonzero(kept[of_each(points.objects, numbers) % len(kept)]))
-        scans.append(replaced(scan, boundaries=with_points(boundaries)))
-    return replace(drive, scans=tuple(scans))
+
+    def of_groups(position: int, c: SemanticClass, points: Boundaries) -> BoolArray:
+        numbers = {n: tracks[position, c, n] for n in numbers_in(points.objects)}
+        return np.asarray(kept[of_each(points.objects, numbers) % len(kept)])
+
+    return _with_some(drive, of_groups)
 
 
 def without_kind(drive: Drive, kind: Edge) -> Drive:
     """The drive without the boundary points of one kind."""
+    return _with_some(drive, lambda _position, _class, points: points.edges != kind)
+
+
+def _with_some(drive: Drive, kept: Callable[[int, SemanticClass, Boundaries], BoolArray]) -> Drive:
+    """The drive with the boundary points (n,) that are kept of each class in each scan, by its position."""
     scans = []
-    for scan in drive.scans:
-        kept = {c: points.take(np.flatnonzero(points.edges != kind)) for c, points in scan.boundaries.items()}
-        scans.append(replaced(scan, boundaries=with_points(kept)))
+    for position, scan in enumerate(drive.scans):
+        some = {
+            c: points.take(np.flatnonzero(kept(position, c, points))) for c, points in scan.boundaries.items()
+        }
+        scans.append(replaced(scan, boundaries=with_points(some)))
     return replace(drive, scans=tuple(scans))

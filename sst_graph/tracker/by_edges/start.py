@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sst_graph.batch.by_edges.optimum import RESTARTS, best_optimum_steps, refined_steps, starts_steps
+from sst_graph.batch.by_edges.optimum import RESTARTS, best_optimum_steps, candidate_steps
 from sst_graph.batch.by_edges.problem import LabelEstimate, checking_motion, edges_problem, motion_alone
 from sst_graph.batch.by_edges.reasons import edge_contrast_steps, edges_reasons, pose_reasons
 from sst_graph.batch.problem import CalibrationProblem
@@ -40,8 +40,7 @@ def first_edge_estimate_steps(
     # 2. Starts by a search, refined; the best optimum.
     whole = CalibrationProblem([drive], [stretch.motion(drive)], [dict(stretch.tracks)], guess, calibration)
     problem = edges_problem(whole, motion, LabelEstimate())
-    starts = yield from starts_steps(problem)
-    candidates = yield from refined_steps(problem, starts)
+    candidates = yield from candidate_steps(problem)
     solution = yield from best_optimum_steps(problem, candidates[0][1].state, RESTARTS)
     # 3. Has it worked, and by how much may it be off?
     state = solution.state

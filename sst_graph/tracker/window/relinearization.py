@@ -12,8 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sst_graph.batch.by_edges.optimum import CONVERGED_STEP
-from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX
+from sst_graph.batch.by_edges.optimum import CONVERGED_STEP, NEAR_KERNELS_PX
 from sst_graph.batch.lower_edges import LowerEdgeSupport
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.outer_loop import INNER_ITERATIONS, NARROW_KERNELS_PX, step_share

@@ -17,10 +17,9 @@ from sst_graph.batch.assumption_tests import ParameterTest
 from sst_graph.batch.by_edges import lens
 from sst_graph.batch.by_edges.covariance import SAMPLES
 from sst_graph.batch.by_edges.lens import MATTERS_SIGMAS, LensTest, lens_steps
-from sst_graph.batch.by_edges.optimum import START_KERNELS_PX
+from sst_graph.batch.by_edges.optimum import NEAR_KERNELS_PX, START_KERNELS_PX
 from sst_graph.batch.by_edges.parts import thinned
 from sst_graph.batch.by_edges.problem import LabelEstimate, edges_problem, motion_alone
-from sst_graph.batch.by_edges.solution import NEAR_KERNELS_PX
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.covariance.considered import AssumptionConfig

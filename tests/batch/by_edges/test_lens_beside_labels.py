@@ -17,7 +17,6 @@ from sst_graph.batch.assumption_tests import ParameterTest, with_further_tests
 from sst_graph.batch.by_edges import covariance
 from sst_graph.batch.by_edges.covariance import SAMPLES
 from sst_graph.batch.by_edges.lens import lens_beside_labels
-from sst_graph.batch.by_edges.solution import solution_steps
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.config import with_overrides
@@ -26,6 +25,7 @@ from sst_graph.drive.edges_of_frames import with_edges
 from sst_graph.drive.preparation import Drive, PrepareConfig
 from sst_graph.experiments.wrong_drives import with_principal_point
 from sst_graph.features.picture_gradients import PictureGradients
+from sst_graph.graph.outer_loop import solve_joint_steps
 from sst_graph.graph.state import State
 from sst_graph.metrics import tangent_error
 from sst_graph.types import Guess
@@ -62,10 +62,10 @@ def counted(
 
     def counting(*arguments: object) -> object:
         solved.append(1)
-        return solution_steps(*arguments)  # type: ignore[arg-type]
+        return solve_joint_steps(*arguments)  # type: ignore[arg-type]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(covariance, "solution_steps", counting)
+        patch.setattr(covariance, "solve_joint_steps", counting)
         return found(drive(right_px), beside), len(solved)
 
 
