@@ -18,10 +18,10 @@ from sst_graph.covariance.level_edges import LevelEdges
 from sst_graph.covariance.sums import ScoreSums
 from sst_graph.factors.alignment import weighted_residuals
 from sst_graph.factors.robust import RobustKernel
-from sst_graph.graph.building import bias_groups, state_from
+from sst_graph.graph.building import state_from
 from sst_graph.graph.elimination import NormalEquations, Unknowns
 from sst_graph.graph.matching import PairMatches
-from sst_graph.graph.state import State, nuisance_key, time_offset_key, twist_key
+from sst_graph.graph.state import State, bias_key, nuisance_key, object_bias_key, time_offset_key, twist_key
 from sst_graph.objects.tracks import ObjectId
 from sst_graph.types import FloatArray, IntArray, SemanticClass
 
@@ -160,14 +160,13 @@ def _rows(
     V_key = twist_key(pair.drive, pair.pair.image)
     c_twist, response = motion.values.atVector(V_key), motion.responses[V_key]
     alignment = pair.matches[c].alignment
-    groups = bias_groups(pair, c)
-    of_class = state.biases_px.get((pair.drive, c), 0.0)
-    biases_px, columns = np.full(len(alignment), of_class), np.zeros(len(alignment), np.intp)
-    for key, some in groups:
-        own: slice | IntArray = slice(None) if some is None else some
-        columns[own] = unknowns.column(key)
-        if some is not None:
-            biases_px[own] = state.object_bias_px(pair.drive, int(pair.tracks[c][some[0]]), c)
+    if c in pair.tracks:
+        names, groups = pair.biased[c]
+        columns = np.array([unknowns.column(object_bias_key(pair.drive, track)) for track in names])[groups]
+        biases_px = np.array([state.object_bias_px(pair.drive, track, c) for track in names])[groups]
+    else:
+        columns = np.full(len(alignment), unknowns.column(bias_key(pair.drive, c)))
+        biases_px = np.full(len(alignment), state.biases_px.get((pair.drive, c), 0.0))
     r, J, _ = weighted_residuals(alignment, state.cTl, state.time_offset_s(pair.drive), c_twist, biases_px)
     roots = np.abs(J[:, 13]) * alignment.sigmas_px
     block = J[:, 7:13] @ response

@@ -7,7 +7,6 @@ from functools import partial
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.assumptions import ASSUMPTIONS, named_sigmas
 from sst_graph.drive.twists import camera_twist
@@ -122,16 +121,6 @@ def motion_factor(
     covariance = camera_twist(pair.l_twist, cTl).covariance
     lidar_twist = LidarTwist(pair.l_twist.twist, pair.l_twist.acceleration, time_offset_s)
     return twist_transfer_factor(V, E, D, lidar_twist, covariance)
-
-
-def bias_groups(pair: PairMatches, c: SemanticClass) -> list[tuple[int, NDArray[np.intp] | None]]:
-    """Key of the mask bias, and the matches that share it (None for all): by object where it is tracked."""
-    if c not in pair.tracks:
-        return [(bias_key(pair.drive, c), None)]
-    names, groups = pair.biased[c]
-    return [
-        (object_bias_key(pair.drive, track), np.flatnonzero(groups == k)) for k, track in enumerate(names)
-    ]
 
 
 def _add_calibration(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -70,9 +70,10 @@ def residual_columns(
     scene: Scene,
     base_tau_s: float | FloatArray,
     pose: tuple[gtsam.Pose3, float, FloatArray],
-    names: Iterable[str],
+    names: Sequence[str],
+    J: FloatArray | None = None,
 ) -> dict[str, FloatArray]:
-    """Derivatives (n,) of the residuals of silhouettes by assumptions' parameters [px per unit].
+    """Derivatives (n,) of the residuals of silhouettes by assumptions' parameters [px per unit], by name.
 
     Args:
         alignment: the matches.
@@ -80,33 +81,14 @@ def residual_columns(
         base_tau_s: stamp of the image minus that of the scan, one for all or (n,) [s].
         pose: the extrinsic, the time offset [s], and the camera's twist (6,) or (6, n) [rad/s, m/s].
         names: of the assumptions.
+        J: (n, 14) of the residuals by [rot, trans, offset, twist, bias], where it is known; where it is
+            weighted, the derivatives are, too.
     """
-    names = list(names)
     effects = _effects(alignment, scene, base_tau_s, pose, names)
     # Where pixels move alone, a residual follows its pixel, and the motion's Jacobian is not needed.
-    J = None if all(map(_moves_pixels_alone, effects)) else residuals(alignment, *pose, 0.0)[1]
+    if J is None and not all(map(_moves_pixels_alone, effects)):
+        J = residuals(alignment, *pose, 0.0)[1]
     return {name: _column(alignment, J, pose[0], effect) for name, effect in zip(names, effects, strict=True)}
-
-
-def columns_of_jacobian(
-    J: FloatArray,
-    alignment: Alignment,
-    scene: Scene,
-    base_tau_s: float | FloatArray,
-    pose: tuple[gtsam.Pose3, float, FloatArray],
-    names: Sequence[str],
-) -> FloatArray:
-    """Derivatives (n, k) of residuals by assumptions' parameters, from the Jacobian J; weighted as its rows
-    are.
-
-    Args:
-        J: (n, 14) by [rot, trans, offset, twist, bias], of residuals as they are or weighted.
-        alignment, scene, base_tau_s, pose, names: as of :func:`residual_columns`.
-    """
-    columns = np.zeros((len(alignment), len(names)))
-    for place, effect in enumerate(_effects(alignment, scene, base_tau_s, pose, names)):
-        columns[:, place] = _column(alignment, J, pose[0], effect)
-    return columns
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import gtsam
 import numpy as np
@@ -29,6 +30,8 @@ from sst_graph.metrics import turn_rad
 from sst_graph.sampling import evenly_spread
 from sst_graph.stepwise import Stepwise
 from sst_graph.types import Calibration, FloatArray, IntArray
+
+_Start = TypeVar("_Start", Calibration, State)
 
 SELECTION_SCANS = 10
 """Most scans of each drive that candidates are compared on."""
@@ -155,7 +158,8 @@ def select_among_steps(
     good = scores > _SELECTED_RATIO * scores[0]
     cTls = _cTls(poses.take(np.flatnonzero(good)))
     starts = [Calibration(*pair) for pair in zip(cTls, poses.offsets[good].tolist(), strict=True)]
-    return Selection(_with_alternative(starts, scores[good]), _far_apart(starts), candidates[0].score)
+    distant = tuple(far_apart(starts, _FAR_RAD)[:_DISTANT])
+    return Selection(_with_alternative(starts, scores[good]), distant, candidates[0].score)
 
 
 def alternatives(solutions: Sequence[JointSolution]) -> list[JointSolution]:
@@ -179,13 +183,13 @@ def _with_alternative(starts: Sequence[Calibration], scores: FloatArray) -> tupl
     return tuple(starts[:_SELECTED])
 
 
-def _far_apart(starts: Sequence[Calibration]) -> tuple[Calibration, ...]:
-    """Some starts that are turned by more than :data:`_FAR_RAD` against every better one."""
-    chosen: list[Calibration] = []
+def far_apart(starts: Sequence[_Start], least_rad: float) -> list[_Start]:
+    """Some starts that are turned by more than an angle [rad] against every better one."""
+    chosen: list[_Start] = []
     for start in starts:
-        if all(turn_rad(start.cTl, other.cTl) > _FAR_RAD for other in chosen):
+        if all(turn_rad(start.cTl, other.cTl) > least_rad for other in chosen):
             chosen.append(start)
-    return tuple(chosen[:_DISTANT])
+    return chosen
 
 
 def _alike(one: State, other: State) -> bool:

@@ -10,7 +10,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from sst_graph.batch.by_edges.choice import with_method_for_cameras, with_method_of
+from sst_graph.batch.by_edges.choice import choice_for_cameras, with_method_of
 from sst_graph.batch.by_edges.method import edges_method
 from sst_graph.batch.by_edges.problem import with_fewer_points
 from sst_graph.batch.calibrate import (
@@ -90,7 +90,7 @@ def calibrate_rig(
     initial = {} if initial is None else initial
     initial_time_offsets_s = {} if initial_time_offsets_s is None else initial_time_offsets_s
     guesses = _guesses(list(sources), initial, initial_time_offsets_s)
-    config = with_method_for_cameras(expect_settings(config, CalibrationConfig), list(sources.values()))
+    config, _ = choice_for_cameras(expect_settings(config, CalibrationConfig), list(sources.values()))
     _check(sources, config)
     known.check(list(sources))
     drives = prepare_rig(sources, config, progress)
@@ -101,7 +101,7 @@ def prepare_rig(
     sources: Mapping[str, Sequence[Source]], config: CalibrationConfig, progress: Progress | None = None
 ) -> dict[str, list[Drive]]:
     """The drives of each camera; scans, odometry and sweep are those of the first, prepared once."""
-    config = with_method_for_cameras(config, list(sources.values()))
+    config, _ = choice_for_cameras(config, list(sources.values()))
     (first, own), *others = sources.items()
     drives = {first: prepare_drives(own, config, progress)}
     for name, theirs in others:

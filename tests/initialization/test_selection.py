@@ -30,12 +30,14 @@ from sst_graph.initialization.global_search import Candidate, SearchConfig
 from sst_graph.initialization.label_agreement import States
 from sst_graph.initialization.pose_batch import Poses
 from sst_graph.initialization.selection import (
+    _DISTANT,
+    _FAR_RAD,
     _NARROW_STAGE,
     _WIDE_STAGES,
     Selection,
     _different,
-    _far_apart,
     _with_alternative,
+    far_apart,
     select_among_steps,
     select_start_steps,
 )
@@ -114,7 +116,7 @@ def test_the_best_start_comes_first_then_its_alternative() -> None:
 
 def test_distant_starts_are_far_apart_and_the_best_comes_first() -> None:
     starts = [Calibration(turned(0.0, 0.0, a), 0.0) for a in (0.0, 10.0, 60.0, 65.0, 120.0, 170.0)]
-    assert [round(off_deg(start.cTl)) for start in _far_apart(starts)] == [0, 60, 120]
+    assert [round(off_deg(start.cTl)) for start in far_apart(starts, _FAR_RAD)[:_DISTANT]] == [0, 60, 120]
 
 
 def test_the_right_one_of_three_is_selected() -> None:

@@ -36,26 +36,15 @@ def with_method_for(config: CalibrationConfig, sources: Sequence[Source]) -> Cal
     return replace(config, method=_method(sampled, config))
 
 
-def with_method_for_cameras(
-    config: CalibrationConfig, cameras: Sequence[Sequence[Source]]
-) -> CalibrationConfig:
-    """The settings with one method for all cameras on a LiDAR, where the method is auto: by labels where
-    each of them has some, by edges otherwise.
-
-    Args:
-        cameras: drives of each; the scans of the first are those of all, and are read from there.
-
-    Raises:
-        DataError: a frame cannot be read.
-    """
-    return choice_for_cameras(config, cameras)[0]
-
-
 def choice_for_cameras(
     config: CalibrationConfig, cameras: Sequence[Sequence[Source]]
 ) -> tuple[CalibrationConfig, list[int]]:
-    """:func:`with_method_for_cameras`, and the positions of the cameras for which method auto takes edges in
-    the place of labels: a drive of theirs has pictures and no labels.
+    """The settings with one method for all cameras on a LiDAR, where the method is auto: by labels where each
+    of them has some, by edges otherwise; and the positions of the cameras for which method auto takes edges
+    in the place of labels: a drive of theirs has pictures and no labels.
+
+    Args:
+        cameras: drives of each; the scans of the first are those of all, and are read from there.
 
     Raises:
         DataError: a frame cannot be read.

@@ -9,7 +9,7 @@ import gtsam
 
 from sst_graph.batch.by_edges.optimum import candidate_steps
 from sst_graph.batch.by_edges.problem import LabelEstimate, edges_problem
-from sst_graph.batch.by_edges.reasons import contrast_reasons, edge_contrast
+from sst_graph.batch.by_edges.reasons import contrast_reasons, edge_contrast_steps
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.diagnosis import INVERTED, Finding
@@ -42,7 +42,7 @@ def inverted_start(drives: Sequence[Drive], guess: Guess, config: CalibrationCon
     except EstimationError:
         return None
     best, *others = [solution.state for _, solution in found]
-    contrast = edge_contrast(problem.subset_edges, best, others, config.seed)
+    contrast = run_to_end(edge_contrast_steps(problem.subset_edges, best, others, config.seed))
     if contrast_reasons(contrast):
         return None
     cause, check = INVERTED

@@ -21,7 +21,7 @@ from sst_graph.batch.by_edges.optimum import (
 from sst_graph.batch.by_edges.problem import LabelEstimate, checking_motion, edges_problem, motion_alone
 from sst_graph.batch.by_edges.reasons import (
     EdgeContrast,
-    edge_contrast,
+    edge_contrast_steps,
     edges_reasons,
     pose_reasons,
     with_lens_reasons,
@@ -86,7 +86,8 @@ def edges_method(
     # 5. Has it worked?
     others = [one.state for _, one in candidates]
     with stage(progress, "contrast of the edges"):
-        contrast = edge_contrast(problem.subset_edges, solution.state, others, config.seed)
+        scores = edge_contrast_steps(problem.subset_edges, solution.state, others, config.seed)
+        contrast = run_to_end(scores)
     checking = checking_motion(motion, config)
     of_pose = pose_reasons(solution.state, contrast, checking, covariance)
     reasons = edges_reasons(solution, of_pose, problem.centre)

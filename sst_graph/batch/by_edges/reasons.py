@@ -15,7 +15,7 @@ from sst_graph.graph.outer_loop import JointSolution, still_moved
 from sst_graph.graph.state import State, difference, step_text
 from sst_graph.hand_eye.solution import MotionSolution
 from sst_graph.metrics import turn_rad
-from sst_graph.stepwise import Stepwise, run_to_end
+from sst_graph.stepwise import Stepwise
 from sst_graph.types import FloatArray
 
 SCORE_WORK = 5
@@ -67,13 +67,6 @@ class EdgeContrast:
         return {**asdict(self), "least_sigmas": MIN_CONTRAST, "least_over_other": MIN_OVER_OTHER}
 
 
-def edge_contrast(
-    edges: Sequence[DriveEdges], state: State, others: Sequence[State], seed: int
-) -> EdgeContrast:
-    """All steps of :func:`edge_contrast_steps`."""
-    return run_to_end(edge_contrast_steps(edges, state, others, seed))
-
-
 def edge_contrast_steps(
     edges: Sequence[DriveEdges], state: State, others: Sequence[State], seed: int
 ) -> Stepwise[EdgeContrast]:
@@ -86,17 +79,8 @@ def edge_contrast_steps(
     apart = [each for each in others if np.degrees(turn_rad(each.cTl, state.cTl)) > _APART_DEG]
     other = max((score(edges, each, BLUR_PX) for each in apart), default=0.0)
     yield SCORE_WORK * (1 + len(apart))
-    return contrast_of(own, around, other)
-
-
-def contrast_of(own: float, around: Sequence[float], other: float) -> EdgeContrast:
-    """How far a score stands out from those of random rotations.
-
-    Args:
-        other: score of the best other optimum; 0 without one.
-    """
-    spread = float(np.std(around)) + 1e-9
-    return EdgeContrast(own, (own - float(np.mean(around))) / spread, own / max(max(around), 1e-9), other)
+    height, spread = own - float(np.mean(around)), float(np.std(around)) + 1e-9
+    return EdgeContrast(own, height / spread, own / max(max(around), 1e-9), other)
 
 
 def unsettled_reasons(step: FloatArray) -> tuple[str, ...]:

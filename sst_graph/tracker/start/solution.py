@@ -31,7 +31,7 @@ from sst_graph.graph.outer_loop import (
 )
 from sst_graph.graph.state import State
 from sst_graph.initialization.candidates import StartProblem
-from sst_graph.initialization.selection import select_start_steps
+from sst_graph.initialization.selection import far_apart, select_start_steps
 from sst_graph.metrics import turn_rad
 from sst_graph.stepwise import Stepwise
 from sst_graph.tracker.config import TrackerConfig
@@ -108,7 +108,7 @@ def first_estimate_steps(drive: Drive, guess: StartGuess, config: TrackerConfig)
     # 1. Candidates, with time offsets around the guess's.
     starts = yield from _starts(drive, motion, guess, config, reach)
     # 2. Solutions from their poses with the guess's time offset, and from the candidates as they are.
-    held = [State(start.cTl, (guess.time_offset_s,)) for start in _one_of_each_basin(starts)]
+    held = [State(start.cTl, (guess.time_offset_s,)) for start in far_apart(starts, _OTHER_BASIN_RAD)]
     # After a search the starts are near.
     kernels_px = NARROW_KERNELS_PX if searched else KERNELS_PX
     families = [held, starts] if reach > 0.0 else [starts]
@@ -123,15 +123,6 @@ def first_estimate_steps(drive: Drive, guess: StartGuess, config: TrackerConfig)
             best = other
     _check_not_converged(best, failed)
     return best.point
-
-
-def _one_of_each_basin(starts: Sequence[State]) -> list[State]:
-    """One start of each basin of convergence: those in the basin of an earlier one are left out."""
-    chosen: list[State] = []
-    for start in starts:
-        if all(turn_rad(start.cTl, other.cTl) > _OTHER_BASIN_RAD for other in chosen):
-            chosen.append(start)
-    return chosen
 
 
 def _all_of(attempts: Sequence[Stepwise[_Solved]]) -> Stepwise[tuple[list[_Solved], list[EstimationError]]]:

@@ -16,7 +16,7 @@ from sst_graph.assumptions.model import Scene
 from sst_graph.factors.matches import Alignment, joined
 from sst_graph.factors.reprojection import ImageGroups, weigh
 from sst_graph.graph.matching import PairMatches
-from sst_graph.graph.nuisances import columns_of_jacobian
+from sst_graph.graph.nuisances import residual_columns
 from sst_graph.graph.state import lower_edge_track
 from sst_graph.objects.tracks import numbers_in, of_each
 from sst_graph.tracker.sums.held import EDGE_ERRORS, edge_error_columns
@@ -124,12 +124,12 @@ def _of_class(pairs: Sequence[PairAt], c: SemanticClass) -> list[Rows]:
     columns = [one.bias_columns(c) for one in pairs]
     biases = np.concatenate([one.scalars[own - 7] for one, own in zip(pairs, columns, strict=True)])
     J, r = _weighted(pairs, alignment, np.array(counts), biases)
-    roots, known = np.abs(J[:, 13]) * alignment.sigmas_px, np.zeros((len(r), 0))
+    roots, known = np.abs(J[:, 13]) * alignment.sigmas_px, np.zeros((0, len(r)))
     if assumptions:
         twists = np.repeat([one.pair.motion.c_twist for one in pairs], counts, axis=0)
         base_taus_s = np.repeat([one.pair.pair.base_tau_s for one in pairs], counts)
         at, scene = (point.cTl, point.time_offset_s, twists.T), _scene(pairs, counts)
-        known = columns_of_jacobian(J, alignment, scene, base_taus_s, at, assumptions)
+        known = np.array([*residual_columns(alignment, scene, base_taus_s, at, assumptions, J).values()])
     assert alignment.normals is not None
     by_picture = J[:, 13:14] * alignment.normals
     ends = np.cumsum(counts).tolist()
@@ -141,7 +141,7 @@ def _of_class(pairs: Sequence[PairAt], c: SemanticClass) -> list[Rows]:
         block[np.arange(end - start), places] = J[some, 13]
         for place, name in zip(point.parameter_columns, point.names, strict=True):
             block[:, place] = one.pair.terms[c][name] * J[some, 13]
-        block[:, point.size : point.size + len(assumptions)] = known[some]
+        block[:, point.size : point.size + len(assumptions)] = known[:, some].T
         if held and c == SemanticClass.OBJECT:
             errors = edge_error_columns(J[some], one.pair.matches[c], one.columns.config)
             block[:, point.size + len(assumptions) :] = errors

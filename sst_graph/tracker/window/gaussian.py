@@ -89,10 +89,9 @@ class Point:
         biases = [known.get(track, float(self.biases_px[place])) for track, place in places.items()]
         return replace(self, tracks=tuple(places), object_biases_px=np.array(biases))
 
-    def with_object(self, track: int, bias_px: float) -> Point:
-        """The point with one more object."""
-        biases = np.append(self.object_biases_px, bias_px)
-        return replace(self, tracks=(*self.tracks, track), object_biases_px=biases)
+    def with_objects(self, places: Mapping[int, int]) -> Point:
+        """The point with further objects, as :meth:`seen` has them."""
+        return self.seen({**dict.fromkeys(self.tracks, 0), **places})
 
     def core(self) -> Point:
         """The point without objects."""
@@ -208,13 +207,7 @@ class Gaussian:
         """
         if not places:
             return self
-        of_class = [float(self.point.biases_px[place]) for place in places.values()]
-        point = replace(
-            self.point,
-            tracks=(*self.point.tracks, *places),
-            object_biases_px=np.append(self.point.object_biases_px, of_class),
-        )
-        n, size = self.point.size, len(self.vector) + len(places)
+        point, n, size = self.point.with_objects(places), self.point.size, len(self.vector) + len(places)
         information, vector = np.zeros((size, size)), np.zeros(size)
         before = np.array([*range(n), *range(point.size, size)])
         information[np.ix_(before, before)], vector[before] = self.information, self.vector

@@ -298,8 +298,7 @@ class WindowSmoother:
         motion of each pair marginalised out."""
         places = {t: place for pair in found.values() for t, place in pair.linear.places.items()}
         new = {t: place for t, place in places.items() if t not in self.past.point.tracks}
-        for track in new.keys() - set(point.tracks):
-            point = point.with_object(track, float(point.biases_px[places[track]]))
+        point = point.with_objects({t: place for t, place in new.items() if t not in point.tracks})
         past = self.observed.without_held().with_objects(new, self.graph.object_bias_sigma_px)
         return self._with_pairs(past.at(point), found)
 

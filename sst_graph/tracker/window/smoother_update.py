@@ -131,10 +131,9 @@ class SmootherUpdate:
         gaussians = (self.past, self.observed, self.static)
         self.past, self.observed, self.static = (g.with_objects(new, sigma_px) for g in gaussians)
         self.sums.grow(self.past.point.size)
+        self.point = self.point.with_objects(new)
         for track, place in new.items():
-            bias = float(self._smoother.point.biases_px[place])
-            self._values.insert(object_bias_key(0, track), np.array([bias]))
-            self.point = self.point.with_object(track, bias)
+            self._values.insert(object_bias_key(0, track), self.point.biases_px[[place]])
 
     def _marginalize_objects(self) -> None:
         """Objects that the window does not see, and that will not be seen again, leave the unknowns."""
