@@ -236,9 +236,9 @@ def _steps_answering(value: Any) -> Change:
 
 
 def _start_as_guessed(_: Any) -> Any:
-    def steps(problem):  # type: ignore[no-untyped-def]
+    def steps(edges, region):  # type: ignore[no-untyped-def]
         yield 1
-        return [State(problem.region.cTl, problem.region.time_offsets_s[:1])]
+        return [State(region.cTl, region.time_offsets_s[:1])]
 
     return steps
 
@@ -983,7 +983,7 @@ BY_EDGES: tuple[Case, ...] = (
     Case(
         "edges_search",
         "search for starts (the guess)",
-        changes={"batch.by_edges.optimum:starts_steps": _start_as_guessed},
+        changes={"batch.by_edges.optimum:edge_starts_steps": _start_as_guessed},
         lines=("edges/search.py",),
         more_lines=30,
         methods=(EDGES,),
@@ -1102,7 +1102,7 @@ BY_EDGES: tuple[Case, ...] = (
             "batch.by_edges.reasons:MIN_CONTRAST": to(-1e9),
             "batch.by_edges.reasons:MIN_OVER_OTHER": to(1e-9),
         },
-        lines=("batch/by_edges/reasons.py:edge_contrast", "edges/turns.py"),
+        lines=("batch/by_edges/reasons.py:edge_contrast_steps", "edges/turns.py"),
         more_lines=30,
         methods=(EDGES,),
     ),

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sst_graph import CalibrationConfig
-from sst_graph.batch.by_edges.choice import with_method_for_cameras
+from sst_graph.batch.by_edges.choice import choice_for_cameras
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.rig import KnownPose, KnownRig
@@ -82,9 +82,9 @@ def test_method_auto_is_edges_where_a_camera_has_no_labels() -> None:
     config = CalibrationConfig()
 
     def method(*cameras: KeptDrive) -> str:
-        return with_method_for_cameras(config, [[camera] for camera in cameras]).method
+        return choice_for_cameras(config, [[camera] for camera in cameras])[0].method
 
     assert method(labelled, labelled) == "joint"
     assert method(labelled, nothing) == method(nothing, labelled) == method(nothing, nothing) == "edges"
-    by_labels = with_method_for_cameras(replace(config, method="joint"), [[nothing]])
+    by_labels, _ = choice_for_cameras(replace(config, method="joint"), [[nothing]])
     assert by_labels.method == "joint"
