@@ -14,15 +14,13 @@ from dataclasses import dataclass, field, replace
 from sst_graph.association.edge_matching import BOTTOM
 from sst_graph.batch.config import UseLowerEdges
 from sst_graph.drive.preparation import Drive, Progress
-from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.drive_motion import DriveMotion
-from sst_graph.graph.matching import edges_of, match_all
+from sst_graph.graph.matching import edges_of
 from sst_graph.graph.outer_loop import (
-    CONCENTRATION_SCALES,
-    KERNELS_PX,
     JointConfig,
     JointProblem,
     JointSolution,
+    close_and_wide_matches,
     solve_all,
     support_of,
 )
@@ -121,12 +119,6 @@ def lower_edge_support(
     classes = {c for drive in drives for scan in drive.scans for c in scan.lower_edges}
     graph = replace(joint.graph, lower_edges=tuple(sorted(classes)))
     edges = edges_of(drives, motions, graph)
-    narrow, wide = (
-        support_of(
-            match_all(edges, state, RobustKernel("geman_mcclure", scale * KERNELS_PX[-1])),
-            state,
-            BOTTOM,
-        )
-        for scale in CONCENTRATION_SCALES
+    return LowerEdgeSupport(
+        *(support_of(matches, state, BOTTOM) for matches in close_and_wide_matches(edges, state))
     )
-    return LowerEdgeSupport(narrow, wide)

@@ -23,6 +23,9 @@ from sst_graph.types import FloatArray
 CONTRADICTIONS = "contradictions between frames"
 """Name of the stage of a calibration that solves parts by themselves."""
 
+_KERNELS_PX = (20.0, 12.0, 8.0, 5.0, 4.0, 3.0)
+"""Scales of the robust kernel of a part's solution, outer iteration by outer iteration [px]."""
+
 _MOST_AT_LAST_SCALE = 3
 """Most further outer iterations at the last kernel scale: what is left of a step then is within a sigma."""
 
@@ -66,12 +69,10 @@ class PartSolver:
         problem: the drives, and how all of them were solved together.
         reference: the estimate of all drives together, where the parts start and what their weak priors are
             centred on.
-        kernels_px: scales of the robust kernel of a part's solution, outer iteration by outer iteration [px].
     """
 
     problem: CalibrationProblem
     reference: State
-    kernels_px: tuple[float, ...] = (20.0, 12.0, 8.0, 5.0, 4.0, 3.0)
 
     @property
     def drives(self) -> Sequence[Drive]:
@@ -79,14 +80,14 @@ class PartSolver:
 
     def solve(self, part: Part) -> SolvedPart | None:
         """A part's own estimate, from the reference; None where it has none."""
-        found = self._solved(part, self.reference_of(part), self.kernels_px)
+        found = self._solved(part, self.reference_of(part), _KERNELS_PX)
         own = 0.0 if found is None else self.total_support(part, found.state)
         # Where an image or a scan is lost and the numbering goes on, outlines of close objects move too far
         # for a kernel to reach: one frame earlier or later has far more support than what is found here.
         beside = [(self.total_support(part, state), state) for state in self._frames_beside(part)]
         support, start = max(beside, key=lambda one: one[0])
         if support > _FAR_MORE * own:
-            return self._solved(part, start, self.kernels_px) or found
+            return self._solved(part, start, _KERNELS_PX) or found
         return found
 
     def _frames_beside(self, part: Part) -> list[State]:
@@ -101,7 +102,7 @@ class PartSolver:
 
     def solve_from(self, part: Part, start: State) -> SolvedPart | None:
         """A part solved by itself from a start that is nearly right; None where it has no estimate."""
-        return self._solved(part, start, self.kernels_px[len(self.kernels_px) // 2 :])
+        return self._solved(part, start, _KERNELS_PX[len(_KERNELS_PX) // 2 :])
 
     def estimates(self, found: SolvedPart, start: State) -> tuple[SolvedPart, ...]:
         """A part's estimate, and the one from another start where the part supports that nearly as well: the
@@ -150,7 +151,7 @@ class PartSolver:
     def support(self, part: Part, state: State) -> FloatArray:
         """(scans,) how much each scan of a part agrees with a state: matches, counted by robust weight."""
         drive, motion = self._data(part)
-        kernel = RobustKernel("geman_mcclure", self.kernels_px[-1])
+        kernel = RobustKernel("geman_mcclure", _KERNELS_PX[-1])
         found = np.zeros(len(part.scans))
         for own in match_all(edges_of([drive], [motion], self.problem.config.noise), state, kernel):
             scans = np.array([pair.scan for pair in own.pairs])[own.pair_of]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -58,7 +58,7 @@ KERNELS_PX = (20.0, 20.0, 15.0, 15.0, 10.0, 10.0, 7.0, 7.0, 5.0, 5.0, 4.0, 3.0)
 
 20 px are 1.6 degrees with KITTI's camera, the error that a start may have; 3 px are more than most errors of
 masks. The other schedules end at the same 3 px: :data:`NARROW_KERNELS_PX` (the batch and the tracker after a
-search, the tracker's whole window), ``kernels_px`` of :class:`sst_graph.batch.part_solver.PartSolver`,
+search, the tracker's whole window), ``_KERNELS_PX`` of :mod:`sst_graph.batch.part_solver`,
 ``_ALL_FREE_KERNELS_PX`` and ``_NEAR_KERNELS_PX`` of :mod:`sst_graph.batch.assumption_tests`,
 ``_KERNELS_PX`` of :mod:`sst_graph.batch.lower_edges`. New frames in the tracker are matched at the last
 scale."""
@@ -66,7 +66,7 @@ NARROW_KERNELS_PX = KERNELS_PX[6:]
 """Schedule from a start that is nearly right, which wide kernels would lead away from [px]."""
 INNER_ITERATIONS = 2
 """Most Levenberg-Marquardt iterations on frozen matches: the next matches are worth more than a third."""
-CONCENTRATION_SCALES = (1.0, 5.0)
+_CONCENTRATION_SCALES = (1.0, 5.0)
 """Kernel scales, in units of the last one, whose supports :func:`concentration` compares."""
 MIN_EXPLAINED = 0.2
 """Least :func:`explained`, the share of the boundary points in view that meet a contour, of a result."""
@@ -332,14 +332,15 @@ def concentration(solution: JointSolution, problem: JointProblem) -> float:
     pose that was fitted to some contours are spread over all distances.
     """
     edges = edges_of(problem.drives, problem.motions, problem.config.graph)
-    close, wide = (
-        _support(
-            match_all(edges, solution.state, RobustKernel("geman_mcclure", scale * KERNELS_PX[-1])),
-            solution.state,
-        )
-        for scale in CONCENTRATION_SCALES
-    )
+    state = solution.state
+    close, wide = (_support(matches, state) for matches in close_and_wide_matches(edges, state))
     return close / max(wide, 1e-9)
+
+
+def close_and_wide_matches(edges: Sequence[DriveEdges], state: State) -> Iterator[list[DriveMatches]]:
+    """The matches at a state under the last kernel, and under one five times as wide."""
+    for scale in _CONCENTRATION_SCALES:
+        yield match_all(edges, state, RobustKernel("geman_mcclure", scale * KERNELS_PX[-1]))
 
 
 def explained(solution: JointSolution) -> float:

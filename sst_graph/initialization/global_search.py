@@ -12,7 +12,6 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import gtsam
 import numpy as np
 
 from sst_graph.config import Settings, internal, setting
@@ -232,10 +231,8 @@ def _improve_steps(
         found = yield from agreement.score_steps(near)
         following = stages[min(number + 1, len(stages) - 1)][0]
         best, scores = _peaks(near, found, _kept(following, problem), _APART)
-    return [
-        Candidate(gtsam.Pose3(gtsam.Rot3.ClosestTo(R), t), float(offset), float(score))
-        for R, t, offset, score in zip(best.rotations, best.translations, best.offsets, scores, strict=True)
-    ]
+    scored = zip(best.calibrations, scores.tolist(), strict=True)
+    return [Candidate(**vars(calibration), score=score) for calibration, score in scored]
 
 
 def _so3_grid(step: float) -> FloatArray:

@@ -13,13 +13,14 @@ from dataclasses import dataclass
 from typing import Literal, Self
 
 import cv2
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import EstimationError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.stepwise import Stepwise
-from sst_graph.types import FloatArray, IntArray, SemanticClass
+from sst_graph.types import Calibration, FloatArray, IntArray, SemanticClass
 
 Float32 = NDArray[np.float32]
 
@@ -69,6 +70,14 @@ class States:
 
     def __len__(self) -> int:
         return len(self.offsets)
+
+    @property
+    def calibrations(self) -> list[Calibration]:
+        """As single ones."""
+        return [
+            Calibration(gtsam.Pose3(gtsam.Rot3.ClosestTo(R), t), float(offset))
+            for R, t, offset in zip(self.rotations, self.translations, self.offsets, strict=True)
+        ]
 
 
 LabelScore = Literal["votes", "dependence"]

@@ -156,8 +156,7 @@ def select_among_steps(
         raise EstimationError("no candidate of the search leads to a solution near the guess")
     poses, scores = poses.take(order), scores[order]
     good = scores > _SELECTED_RATIO * scores[0]
-    cTls = _cTls(poses.take(np.flatnonzero(good)))
-    starts = [Calibration(*pair) for pair in zip(cTls, poses.offsets[good].tolist(), strict=True)]
+    starts = poses.take(np.flatnonzero(good)).calibrations
     distant = tuple(far_apart(starts, _FAR_RAD)[:_DISTANT])
     return Selection(_with_alternative(starts, scores[good]), distant, candidates[0].score)
 
@@ -216,13 +215,6 @@ def _poses(candidates: Sequence[Candidate], biases: int) -> Poses:
         np.array([candidate.time_offset_s for candidate in candidates]),
         np.zeros((len(candidates), biases)),
     )
-
-
-def _cTls(poses: Poses) -> list[gtsam.Pose3]:
-    return [
-        gtsam.Pose3(gtsam.Rot3.ClosestTo(R), t)
-        for R, t in zip(poses.rotations, poses.translations, strict=True)
-    ]
 
 
 def _centres(poses: Poses, problem: StartProblem) -> Poses:

@@ -79,7 +79,7 @@ class WindowMatcher:
 
     def lower_edge_support(self, point: Point, chosen: Collection[int] | None) -> LowerEdgeSupport:
         """How well the labels agree with the lower edges of some scans (None: all) at a point."""
-        drive, numbers = self.window.drive(None if chosen is None else chosen.__contains__)
+        drive, numbers = self.window.drive(chosen)
         motion, state = self._motion_of(drive, numbers), point.state(self.classes)
         if by_edges(self.classes):
             drive = of_kind(drive, edges=False)
@@ -142,7 +142,7 @@ class WindowMatcher:
         Args:
             without: tracks of objects that do not count.
         """
-        part, numbers = self.window.drive(chosen.__contains__)
+        part, numbers = self.window.drive(chosen)
         found = {}
         for pair in pair_by_time(
             part.scan_stamps_ns, part.image_stamps_ns, point.time_offset_s, part.image_period_s
@@ -204,7 +204,7 @@ class WindowMatcher:
     def _pairs(
         self, point: Point, chosen: Collection[int] | None, kernel: RobustKernel
     ) -> tuple[dict[int, PairMatches], list[int]]:
-        part, numbers = self.window.drive(None if chosen is None else chosen.__contains__)
+        part, numbers = self.window.drive(chosen)
         state = point.state(self.classes)
         motion, pairs = self._motion_of(part, numbers), list[PairMatches]()
         for drive, own_kernel, graph in self._by_kind(part, kernel):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import deque
-from collections.abc import Callable, Collection, Mapping, Sequence, Sized
+from collections.abc import Collection, Mapping, Sequence, Sized
 
 import gtsam
 import numpy as np
@@ -279,10 +279,10 @@ class Window:
         """Stamp of each scan by its number."""
         return {number: scan.stamp_ns for number, scan in self.scans}
 
-    def drive(self, chosen: Callable[[int], bool] | None = None) -> tuple[Drive, list[int]]:
+    def drive(self, chosen: Collection[int] | None = None) -> tuple[Drive, list[int]]:
         """The window as a drive, and the numbers of its scans; or some of its scans, under all motions."""
-        numbers = [number for number, _ in self.scans if chosen is None or chosen(number)]
-        scans = [scan for number, scan in self.scans if chosen is None or chosen(number)]
+        kept = [(number, scan) for number, scan in self.scans if chosen is None or number in chosen]
+        numbers, scans = [number for number, _ in kept], [scan for _, scan in kept]
         motions = tuple(self.motions)
         if chosen is None and scans:
             # As in a drive: the k-th motion leads from the k-th scan to the next.
