@@ -285,8 +285,7 @@ class WindowSmoother:
     def information(self) -> FloatArray:
         """(n, n) of past and window together on the last epoch, matches taken as independent, over the
         unknowns of ``past`` and what it holds."""
-        window = {scan: entry.linear.information for scan, entry in self.entries.items()}
-        return self._last_epoch(self.past, window)
+        return self._with_pairs(self.past, self.entries).information
 
     def vector(self) -> FloatArray:
         """(n,) negative gradient of the cost of past and window by the last epoch, at the estimate, over the
@@ -302,13 +301,18 @@ class WindowSmoother:
         past = self.observed.without_held().with_objects(new, self.graph.object_bias_sigma_px)
         return self._with_pairs(past.at(point), found)
 
-    def _with_pairs(self, past: Gaussian, pairs: Mapping[int, MatchedPair]) -> Gaussian:
-        """A past and pairs, by scan, on the last epoch, about the past's point."""
+    def _with_pairs(self, past: Gaussian, pairs: Mapping[int, MatchedPair], static: bool = False) -> Gaussian:
+        """A past and pairs, by scan, on the last epoch, about the past's point.
+
+        Args:
+            static: of the pairs, the static objects alone.
+        """
         total, numbers = past, {scan: self._epoch_of(scan, pair) for scan, pair in pairs.items()}
         for i, epoch in enumerate(self.epochs):
             if i > 0:
                 total = total.drifted(self.walk(self.epochs[i - 1], epoch))
-            seen = [pair.linear.information for scan, pair in pairs.items() if numbers[scan] == epoch.number]
+            own = [pair.linear for scan, pair in pairs.items() if numbers[scan] == epoch.number]
+            seen = [linear.by_static_objects if static else linear.information for linear in own]
             total = Gaussian(total.point, total.information_with(seen), total.vector_with(seen))
         return total
 
@@ -321,21 +325,10 @@ class WindowSmoother:
 
     def static_information(self) -> FloatArray | None:
         """(n, n) the same by static objects alone; None where no match is of a dynamic one."""
-        window = {scan: entry.linear.by_static_objects for scan, entry in self.entries.items()}
         dynamic = any(entry.linear.static is not None for entry in self.entries.values())
         if not dynamic and np.array_equal(self.static.information, self.past.without_held().information):
             return None
-        return self._last_epoch(self.static, window)
-
-    def _last_epoch(self, past: Gaussian, window: Mapping[int, Gaussian]) -> FloatArray:
-        """(n, n) information of a past and a window, by scan, on the last epoch."""
-        total = past
-        for i, epoch in enumerate(self.epochs):
-            if i > 0:
-                total = total.drifted(self.walk(self.epochs[i - 1], epoch))
-            seen = [window[scan] for scan, e in self.entries.items() if e.epoch == epoch.number]
-            total = replace(total, information=total.information_with(seen))
-        return total.information
+        return self._with_pairs(self.static, self.entries, static=True).information
 
     def covariance(self, information: FloatArray, sums: RunningSums) -> tuple[FloatArray, FloatArray]:
         """(n, n) cluster-robust covariance of the unknowns of ``past``, and that of independent matches.
