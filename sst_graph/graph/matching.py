@@ -369,7 +369,7 @@ class _Motions:
             return cls(rest, rest, None, rest, since_s)
         measured = l_twists.twists
         l_twists = moved_twists(
-            l_twists, state.nuisances, Scene(drive.camera, measured, 0.0, drive.scan_period_s)
+            l_twists, state.nuisances, Scene(drive.camera, measured, 0.0, drive.lidar_period_s)
         )
         Ad = np.asarray(state.cTl.AdjointMap())
         return cls(l_twists.twists @ Ad.T, l_twists.accelerations @ Ad.T, l_twists, measured, since_s)
@@ -381,7 +381,7 @@ class _Motions:
     def scene(self, drive: Drive, of: IntArray | int) -> Scene:
         """What assumptions depend on, of some of the pairs."""
         since_s = self.since_s[of]
-        return Scene(drive.camera, self.measured[of], since_s, drive.scan_period_s)
+        return Scene(drive.camera, self.measured[of], since_s, drive.lidar_period_s)
 
 
 @dataclass(frozen=True)

@@ -50,3 +50,16 @@ def test_the_column_of_the_sweep_where_parameters_have_changed_times(known: dict
     assert np.abs(derivative).max() > 0.3
     whole = np.concatenate([own.offsets_s for pair in matches.by_pair() for own in pair.matches.values()])
     assert not whole.any()
+
+
+def test_a_turn_lasts_as_long_where_every_second_scan_is_used() -> None:
+    drive, state = moving(), State(standing_street().truth.cTl, (OFFSET_S,))
+    (motion,) = motions_of([drive])
+    some = drive.part([0, 2]), motion.part([0, 2])
+    periods = []
+    for own, own_motion in ((drive, motion), some):
+        (edges,) = edges_of([own], [own_motion], GraphConfig())
+        matches = edges.match(state, RobustKernel("geman_mcclure", 5.0))
+        assert matches is not None
+        periods += [pair.scene.period_s for pair in matches.by_pair() if pair.scene is not None]
+    assert len(periods) == 5 and len(set(periods)) == 1
