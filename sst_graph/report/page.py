@@ -313,7 +313,7 @@ def _named(result: CalibrationResult, fit: Fit, name: str, title: str) -> tuple[
 def _residuals(result: CalibrationResult, fit: Fit) -> str:
     return section(
         *_named(result, fit, "residuals", "Residuals"),
-        grid([*residual_charts(fit), convergence_chart(fit, result), *broad_charts(fit, result.camera)]),
+        grid([*residual_charts(fit), convergence_chart(fit, result), *broad_charts(fit, result)]),
     )
 
 
