@@ -159,7 +159,7 @@ def markdown_report(
             ("", "value", "sigma"),
             [
                 *_euler_rows(result),
-                ("time offset", f"{1e3 * result.time_offset_s:+.2f} ms", _sigma_ms(result)),
+                *_offset_rows(result),
             ],
         ),
         "Roll, pitch and yaw are those of the LiDAR in the camera turned to x forward, y left, z up; "
@@ -248,6 +248,20 @@ def _euler_rows(result: CalibrationResult) -> list[tuple[str, str, str]]:
     for name, shift, sigma in zip("xyz", result.T_camera_lidar.translation(), shift_sigmas, strict=True):
         rows.append((name, f"{100.0 * shift:.2f} cm", f"{_short(sigma)} cm"))
     return rows
+
+
+def _offset_rows(result: CalibrationResult) -> list[tuple[str, str, str]]:
+    """The time offset, or that of each drive."""
+    if not result.drive_offsets:
+        return [("time offset", f"{1e3 * result.time_offset_s:+.2f} ms", _sigma_ms(result))]
+    return [
+        (
+            f"time offset of {drive.drive}",
+            f"{1e3 * drive.time_offset_s:+.2f} ms",
+            f"{_short(1e3 * drive.sigma_s)} ms",
+        )
+        for drive in result.drive_offsets
+    ]
 
 
 def _angle_sigmas_deg(angles_deg: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -76,6 +76,10 @@ def test_of_many_reasons_the_summary_has_the_first() -> None:
 def test_summary_names_each_drives_offset() -> None:
     text = summary(replace(RESULT, drive_offsets=(DriveOffset("a/00", -0.05, 0.001),)))
     assert "a/00: -50.00 ms +- 1.0 ms" in text
+    offsets = DriveOffset("a/00", -0.05, 0.001), DriveOffset("b/00", 0.02, 0.012)
+    text = markdown_report(replace(RESULT, drive_offsets=offsets), None, [])
+    assert "| time offset of a/00 | -50.00 ms | 1.0 ms |" in text
+    assert "| time offset of b/00 | +20.00 ms | 12 ms |" in text and "| time offset |" not in text
 
 
 def test_errors_against_the_truth() -> None:
