@@ -41,7 +41,7 @@ def residual_charts(fit: Fit) -> list[str]:
         ),
         _binned(
             points,
-            np.degrees(np.arctan2(points.lPs[:, 1], points.lPs[:, 0])),
+            _azimuths_deg(points.lPs),
             "azimuth of the LiDAR [deg], left is positive",
             "Over the azimuth",
             _AZIMUTH,
@@ -52,6 +52,13 @@ def residual_charts(fit: Fit) -> list[str]:
 def broad_charts(fit: Fit, result: CalibrationResult) -> list[str]:
     """Charts that are as wide as the page, as figures."""
     return [_by_object(fit, result.T_camera_lidar), _over_picture(fit, result.camera)]
+
+
+def _azimuths_deg(lPs: FloatArray) -> FloatArray:
+    """(n,) azimuths of points (n, 3) without a step among them: past 180 deg where a camera looks back."""
+    x, y, _ = lPs.T
+    azimuths, middle = np.arctan2(y, x), np.arctan2(y.mean(), x.mean())
+    return np.asarray(np.degrees(middle + (azimuths - middle + np.pi) % (2.0 * np.pi) - np.pi))
 
 
 _AZIMUTH = (

@@ -8,7 +8,7 @@ import pytest
 
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.fit import Fit, FitQuality, MatchedFrame, PointResiduals
-from sst_graph.report.residual_charts import broad_charts
+from sst_graph.report.residual_charts import _azimuths_deg, broad_charts
 from sst_graph.result import CalibrationResult
 from sst_graph.types import SemanticClass
 
@@ -50,3 +50,12 @@ def test_where_an_object_is_does_not_depend_on_how_the_lidar_is_turned(yaw_deg: 
     listed, _ = broad_charts(_fit(vTs @ R.matrix()), result)
     places = ("vehicle at 12 m, ahead", "vehicle at 14 m, 45° left", "vehicle at 14 m, 45° right")
     assert all(f"<li>{place}, {COUNT} points in 1 frame" in listed for place in places)
+
+
+@pytest.mark.parametrize("middle_deg", [0.0, 90.0, 180.0])
+def test_azimuths_have_no_step_where_a_camera_looks_back(middle_deg: float) -> None:
+    expected = middle_deg + np.linspace(-40.0, 40.0, 9)
+    across = np.radians(expected)
+    lPs = 15.0 * np.stack([np.cos(across), np.sin(across), np.zeros(9)], axis=1)
+    np.testing.assert_allclose(_azimuths_deg(lPs) % 360.0, expected % 360.0, atol=1e-9)
+    np.testing.assert_allclose(np.diff(_azimuths_deg(lPs)), 10.0)
