@@ -303,6 +303,8 @@ class _Part:
         groups: (n,) the bias of each match, or None where all share one.
         columns: columns of the alignment's [J r] that belong to variables, the residual last.
         targets: the same columns in the factor's [J r].
+        sums: (columns, distinct targets) by which columns of one variable are added up, where biases or terms
+            share a key; else None.
         terms: scalars that the residuals depend on besides, and where their values come from.
     """
 
@@ -311,6 +313,7 @@ class _Part:
     groups: NDArray[np.intp] | None
     columns: list[int]
     targets: list[int]
+    sums: FloatArray | None = None
     terms: tuple[tuple[LinearTerm, _Source], ...] = ()
 
     def evaluated(
@@ -323,6 +326,11 @@ class _Part:
         coefficients = np.stack([term.coefficients for term, _ in self.terms])
         steps = np.array([_scalar(source.value(values)) - term.at for term, source in self.terms])
         return found.with_terms(coefficients, steps, jacobians)
+
+    def of_variables(self, rows: FloatArray) -> FloatArray:
+        """(k, len(targets)) rows of the alignment's [J r] by variables, the residual last."""
+        chosen = rows[:, self.columns]
+        return chosen if self.sums is None else chosen @ self.sums
 
     def bias_px(self, values: Sequence[Any]) -> float | FloatArray | None:
         if not self.biases:
@@ -378,7 +386,7 @@ class FrameResidual:
     def _gram(self, weighted: Sequence[tuple[Evaluated, float]]) -> tuple[FloatArray, float]:
         G = np.zeros((self.cols + 1, self.cols + 1))
         for part, (evaluated, _) in zip(self.parts, weighted, strict=True):
-            G[np.ix_(part.targets, part.targets)] += evaluated.gram()[np.ix_(part.columns, part.columns)]
+            G[np.ix_(part.targets, part.targets)] += part.of_variables(part.of_variables(evaluated.gram()).T)
         return G, sum(constant for _, constant in weighted)
 
     def condensed(self, values: Sequence[Any]) -> tuple[FloatArray, FloatArray]:
@@ -389,7 +397,7 @@ class FrameResidual:
         # There are roots at once: those of the rows' short forms.
         R, end = np.zeros((sum(counts), self.cols + 1)), 0
         for part, (evaluated, _), count in zip(self.parts, weighted, counts, strict=True):
-            R[end : end + count, part.targets] = evaluated.root()[:, part.columns]
+            R[end : end + count, part.targets] = part.of_variables(evaluated.root())
             end += count
         return condense_root(R, sum(constant for _, constant in weighted))
 
@@ -399,7 +407,7 @@ class FrameResidual:
             evaluated, part_constant = self._weighted(part, values)
             rows = evaluated.system()
             block = np.zeros((rows.shape[1], self.cols + 1))
-            block[:, part.targets] = rows[part.columns].T
+            block[:, part.targets] = part.of_variables(rows.T)
             blocks.append(block)
             constant += part_constant
         last = np.zeros((1, self.cols + 1))
@@ -477,11 +485,19 @@ def frame_residual(
                 place = variables.columns[value]
                 targets += list(range(place.start, place.stop))
         columns, targets = [*columns, 13 + len(singles)], [*targets, variables.cols]
+        distinct, sums = _summed(targets)
         terms_here = tuple((term, source(term.key)) for term in own_terms)
-        parts.append(
-            _Part(alignment, [source(each) for each in own_biases], groups, columns, targets, terms_here)
-        )
+        sources = [source(each) for each in own_biases]
+        parts.append(_Part(alignment, sources, groups, columns, distinct, sums, terms_here))
     return FrameResidual(tuple(parts), source(pose), source(offset), source(twist), variables)
+
+
+def _summed(targets: list[int]) -> tuple[list[int], FloatArray | None]:
+    """The distinct targets, and (targets, distinct) the sums into them; None where all are distinct."""
+    distinct = list(dict.fromkeys(targets))
+    if len(distinct) == len(targets):
+        return targets, None
+    return distinct, np.equal.outer(targets, distinct).astype(np.float64)
 
 
 def _numbered(name: str, values: Sequence[int | float]) -> list[Argument]:

@@ -217,6 +217,12 @@ class CalibrationResult:
         return topic if isinstance(topic, str) else ""
 
     @property
+    def lens(self) -> str:
+        """Model of the lens from whose pictures the images were rectified; empty where none was."""
+        lens = self.read_as.get("lens")
+        return lens if isinstance(lens, str) else ""
+
+    @property
     def fits(self) -> tuple[Fit, ...]:
         """``fit`` and ``edges_fit``, those that are there."""
         return tuple(fit for fit in (self.fit, self.edges_fit) if fit is not None)

@@ -107,6 +107,7 @@ class SilhouetteMatches:
         sides: (n,) 0 left, 1 right, 2 top, 3 bottom: which side of the object the match lies on.
         index: (n,) which boundary point each match is.
         level_px: (n,) of :func:`level_sigmas`; 0 for objects without a class.
+        offsets_s: (n,) time of each point relative to its scan's stamp, as it was measured [s].
         seen: how many boundary points fall into the image, matched or not.
     """
 
@@ -115,6 +116,7 @@ class SilhouetteMatches:
     sides: NDArray[np.intp]
     index: NDArray[np.intp]
     level_px: FloatArray
+    offsets_s: FloatArray
     seen: int
 
     def __len__(self) -> int:
@@ -311,6 +313,7 @@ def match_silhouettes(
             found.sides[a:b],
             found.index[a:b] - start,
             found.level_px[a:b],
+            points.offsets_s[found.index[a:b]],
             int(seen),
         )
         for c, (a, b), start, seen in zip(

@@ -31,7 +31,7 @@ class Scene:
         l_twist: (6,) the LiDAR's twist at the image's instant [rad/s, m/s], or (k, 6) of several images or
             of each point; zeros where it is not known.
         image_s: stamp of the image minus that of the drive's first image, or (n,) of each point's [s].
-        period_s: time between two scans [s].
+        period_s: time between two scans of the LiDAR, also where some of them are used only [s].
     """
 
     camera: PinholeCamera

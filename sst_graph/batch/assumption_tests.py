@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
-from sst_graph.assumptions import ASSUMPTIONS, Assumption, named_sigmas
+from sst_graph.assumptions import ASSUMPTIONS, Assumption
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate, robust_of
 from sst_graph.covariance.broken_assumptions import Evidence, considered_sigmas
 from sst_graph.covariance.cluster_robust import RobustCovariance, covariance_of
@@ -158,15 +158,14 @@ def examine_assumptions(
     ):
         findings = with_further_tests(findings, further(problem, state, findings), config.threshold)
     considered = estimate.considered(config)
-    return findings, with_test_results(considered, findings)
+    return findings, with_test_results(considered, findings, untested(findings, config))
 
 
 def check_assumptions(problem: SolvedProblem, config: AssumptionConfig) -> tuple[ParameterTest, ...]:
     """Test every assumption that the matches can test; the most contradicted first."""
-    if not config.test:
+    names = _to_be_tested(config)
+    if not names:
         return ()
-    estimated = dict(named_sigmas(problem.problem.config.noise.estimate))
-    names = [name for name, each in ASSUMPTIONS.items() if each.by_matches and name not in estimated]
     try:
         linear = LinearProblem.of(problem, names)
         findings = sorted((linear.alone(name, config) for name in names), key=lambda f: -f.score)
@@ -180,6 +179,26 @@ def check_assumptions(problem: SolvedProblem, config: AssumptionConfig) -> tuple
     except (EstimationError, np.linalg.LinAlgError) as error:
         _LOG.info("assumptions not tested: %s", error)
         return ()
+
+
+def _to_be_tested(config: AssumptionConfig) -> list[str]:
+    """Assumptions that matches can test and whose parameters are not estimated anyway."""
+    estimated = dict(config.estimated)
+    can_be = [name for name, each in ASSUMPTIONS.items() if each.by_matches and name not in estimated]
+    return can_be if config.test else []
+
+
+def untested(findings: Sequence[ParameterTest], config: AssumptionConfig) -> tuple[str, ...]:
+    """Assumptions that were to be tested and could not be: too few matches determine their parameters."""
+    tested = {each.assumption.name for each in findings}
+    return tuple(name for name in _to_be_tested(config) if name not in tested)
+
+
+def untested_remark(names: Sequence[str]) -> tuple[str, ...]:
+    """The remark about assumptions that could not be tested; none where all were."""
+    if not names:
+        return ()
+    return (f"too few matches to test {', '.join(names)}: considered as where nobody has checked the set-up",)
 
 
 @dataclass(frozen=True)
@@ -360,8 +379,11 @@ def few_objects_factor(objects: int, threshold: float) -> float:
     return -float(stdtrit(max(objects - 1, _LEAST_FREEDOM), tail)) / threshold
 
 
-def with_test_results(considered: Considered, findings: Sequence[ParameterTest]) -> Considered:
-    """The considered assumptions, with larger deviations for parameters that the tests leave open."""
+def with_test_results(
+    considered: Considered, findings: Sequence[ParameterTest], untestable: Sequence[str] = ()
+) -> Considered:
+    """The considered assumptions, with larger deviations for parameters that the tests leave open, or that
+    could not be tested."""
     evidence = {
         f.assumption.name: Evidence(
             f.value,
@@ -373,6 +395,9 @@ def with_test_results(considered: Considered, findings: Sequence[ParameterTest])
         for f in findings
         if f.assumption.name in considered.sigmas
     }
+    for name in untestable:
+        each = ASSUMPTIONS[name]
+        evidence[name] = Evidence.none(considered.sigmas[name], each.span, each.prevalence)
     return replace(considered, sigmas={**considered.sigmas, **considered_sigmas(evidence)})
 
 

@@ -16,6 +16,8 @@ from sst_graph.batch.assumption_tests import (
     assumption_report,
     contradiction_sentence,
     examine_assumptions,
+    untested,
+    untested_remark,
 )
 from sst_graph.batch.baselines import baseline_method
 from sst_graph.batch.by_edges.both import both_method
@@ -250,7 +252,7 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
         covariance=total.covariance,
         frames=frames_used(drives, solution),
         reasons=(*_contradicted(tests, contradictions, wrong), *motion.reasons),
-        remarks=(*motion.remarks, *total.remarks),
+        remarks=(*motion.remarks, *total.remarks, *untested_remark(untested(tests, config.assumptions))),
         assumed=assumed_motion(drives),
         by_static_objects=motion.estimate.by_static_objects[:7, :7],
         drive_offsets=drive_offsets(drives, solution.state, unknowns),

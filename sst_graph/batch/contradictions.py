@@ -65,9 +65,11 @@ def find_contradictions(parts: PartSolver) -> Contradictions:
     false_alarm = FALSE_ALARM / tests
     steps = [step for of_drive in stretches if (step := _within(parts, of_drive, false_alarm)) is not None]
     sentences = [_step_sentence(parts, step) for step in steps]
-    # 3. Each drive against the others.
-    solved, own_offsets = _whole_drives(parts, stretches), len(parts.reference.time_offsets_s) > 1
-    against, apart = compare_drives(solved, own_offsets, false_alarm)
+    # 3. Each drive against the others; the extrinsics alone where each has a time offset of its own.
+    solved = _whole_drives(parts, stretches)
+    if len(parts.reference.time_offsets_s) > 1:
+        solved = {number: part.extrinsic() for number, part in solved.items()}
+    against, apart = compare_drives(solved, false_alarm)
     sentences += [_drive_sentence(parts, number, difference) for number, difference in apart.items()]
     diagnostics = {
         "within": [_step_document(parts, step) for step in steps],
@@ -228,22 +230,20 @@ def _whole_drives(parts: PartSolver, stretches: Sequence[Sequence[SolvedPart]]) 
     return solved
 
 
-def _between(solved: Mapping[int, PartEstimate], own_offsets: bool) -> dict[int, Difference]:
+def _between(solved: Mapping[int, PartEstimate]) -> dict[int, Difference]:
     """Each drive against the others together, by the drive's number."""
     # Of two, the second stands for both.
     compared = [*solved][1:] if len(solved) <= 2 else [*solved]
     others = {number: [solved[k] for k in solved if k != number] for number in compared}
-    return {
-        number: Difference.from_others(others[number], solved[number], own_offsets) for number in compared
-    }
+    return {number: Difference.from_others(others[number], solved[number]) for number in compared}
 
 
 def compare_drives(
-    solved: Mapping[int, PartEstimate], own_offsets: bool, false_alarm: float
+    solved: Mapping[int, PartEstimate], false_alarm: float
 ) -> tuple[dict[int, Difference], dict[int, Difference]]:
     """Each drive against the others, and of those that contradict these, the worst one first, the same
     without the worse ones: one that is wrong draws what the others say away from each that is right."""
-    every = against = _between(solved, own_offsets)
+    every = against = _between(solved)
     left, apart = dict(solved), dict[int, Difference]()
     while against:
         worst = max(against, key=lambda number: against[number].chi2)
@@ -251,7 +251,7 @@ def compare_drives(
             break
         apart[worst] = against[worst]
         del left[worst]
-        against = _between(left, own_offsets)
+        against = _between(left)
     return every, apart
 
 

@@ -19,6 +19,7 @@ from sst_graph.cli.messages import complain
 from sst_graph.cli.options import SOURCE_DEFAULTS
 from sst_graph.data import open_source
 from sst_graph.data.info.facts import facts_of
+from sst_graph.data.rectified import lens_of
 from sst_graph.data.source import source_options
 from sst_graph.errors import ConfigError, DataError, SstGraphError
 from sst_graph.files.typed_values import matches
@@ -78,13 +79,13 @@ def options_of(args: argparse.Namespace) -> dict[str, Any]:
     return options
 
 
-def with_image_topic(read_as: Mapping[str, Any], sources: Sequence[Source]) -> dict[str, Any]:
-    """``read_as`` with the topic of the images where none was named and all drives have them on the same."""
-    if read_as["image_topic"] is not None:
-        return dict(read_as)
-    facts = [facts_of(source) for source in sources]
-    topics = {"" if one is None else one.image.topic for one in facts}
-    return {**read_as, "image_topic": topics.pop() or None if len(topics) == 1 else None}
+def with_images_read(read_as: Mapping[str, Any], sources: Sequence[Source]) -> dict[str, Any]:
+    """``read_as`` with the images' topic where none was named, and the lens from whose pictures they were
+    rectified; each where it is that of all drives."""
+    topics = {"" if (facts := facts_of(source)) is None else facts.image.topic for source in sources}
+    lenses = {"" if (lens := lens_of(source)) is None else lens.name for source in sources}
+    topic, lens_name = (names.pop() or None if len(names) == 1 else None for names in (topics, lenses))
+    return {**read_as, "image_topic": read_as["image_topic"] or topic, "lens": lens_name}
 
 
 def open_drive(args: argparse.Namespace, path: Path) -> Source:

@@ -20,7 +20,7 @@ from sst_graph.cli.messages import complain, mention, say
 from sst_graph.cli.output_places import check_apart
 from sst_graph.cli.outputs import CALIBRATION, comparison, result_numbers, why_not_ok, write_calibration
 from sst_graph.cli.progress import ProgressBar
-from sst_graph.cli.reading import options_of, warn_of_other_pairs, with_image_topic
+from sst_graph.cli.reading import options_of, warn_of_other_pairs, with_images_read
 from sst_graph.cli.video import video_of, videos_beside
 from sst_graph.data.info.needed_labels import require_labels
 from sst_graph.errors import ConfigError, count_of
@@ -124,7 +124,7 @@ def _calibrated(
             sources, initial, config, known, initial_time_offsets_s=offsets_s, progress=progress
         )
     results = {
-        name: dataclasses.replace(result, read_as=with_image_topic(read_as[name], sources[name]))
+        name: dataclasses.replace(result, read_as=with_images_read(read_as[name], sources[name]))
         for name, result in rig.cameras.items()
     }
     return sources, dataclasses.replace(rig, cameras=results)

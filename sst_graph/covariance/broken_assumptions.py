@@ -46,7 +46,14 @@ class Evidence:
     span: float
     prevalence: float
 
+    @classmethod
+    def none(cls, prior: float, span: float, prevalence: float) -> Evidence:
+        """Of a parameter of which the data say nothing."""
+        return cls(0.0, _NO_INFORMATION * span, prior, span, prevalence)
 
+
+_NO_INFORMATION = 1e4
+"""Deviation of an estimate without information, in spans."""
 _MOST_LOG = 500.0
 """Largest logarithm of a Bayes factor, so that its exponential is finite."""
 

@@ -148,7 +148,7 @@ def columns_of(
         c_twist = values.atVector(twist_key(pair.drive, pair.pair.image))
         at = state.cTl, state.time_offset_s(pair.drive), c_twist
         for matches in pair.matches.values():
-            found = residual_columns(matches.alignment, pair.scene, pair.pair.base_tau_s, at, names)
+            found = residual_columns(matches.alignment, pair.scene, matches.offsets_s, at, names)
             rows = np.array(list(found.values())).reshape(len(names), len(matches.alignment))
             blocks.append(rows.T)
     return np.concatenate(blocks)

@@ -43,11 +43,12 @@ class PartEstimate:
     """The estimate of one part of the data.
 
     Attributes:
-        step: (7,) from the common reference to the part's estimate, in the tangent space of the reference
-            (right perturbation: rotation [rad], translation [m], offset [s]).
-        covariance: (7, 7) of it, cluster-robust.
+        step: (n,) from the common reference to the part's estimate, in the tangent space of the reference
+            (right perturbation: rotation [rad], translation [m], offset [s]): 7 numbers, or 6 without the
+            offset.
+        covariance: (n, n) of it, cluster-robust.
         clusters: effective number of independent clusters (sides of objects) that the covariance rests on.
-        common: (7,) shift of the estimate by one deviation of each error that all parts share, by its name,
+        common: (n,) shift of the estimate by one deviation of each error that all parts share, by its name,
             such as a principal point that is off; what shifts both parts alike is no contradiction, and does
             not hide one.
     """
@@ -58,8 +59,13 @@ class PartEstimate:
     common: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def shift(self, name: str) -> FloatArray:
-        """(7,) by one deviation of a common error; 0 of one that the part does not have."""
-        return self.common.get(name, np.zeros(7))
+        """(n,) by one deviation of a common error; 0 of one that the part does not have."""
+        return self.common.get(name, np.zeros(len(self.step)))
+
+    def extrinsic(self) -> PartEstimate:
+        """The extrinsic alone, for parts that have a time offset of their own each."""
+        common = {name: step[:6] for name, step in self.common.items()}
+        return replace(self, step=self.step[:6], covariance=self.covariance[:6, :6], common=common)
 
 
 @dataclass(frozen=True)
@@ -67,7 +73,7 @@ class Difference:
     """The difference between the estimates of two parts.
 
     Attributes:
-        step: (n,) from the first to the second; 7 numbers, 6 where each part has a time offset of its own.
+        step: (n,) from the first to the second, as of the parts.
         covariance: (n, n) of it.
         freedom: degrees of freedom of the covariance; infinite where it is known.
     """
@@ -77,26 +83,21 @@ class Difference:
     freedom: float = np.inf
 
     @classmethod
-    def of(cls, one: PartEstimate, other: PartEstimate, own_offsets: bool = False) -> Difference:
+    def of(cls, one: PartEstimate, other: PartEstimate) -> Difference:
         """From one part to another, as :meth:`from_others`."""
-        return cls.from_others([one], other, own_offsets)
+        return cls.from_others([one], other)
 
     @classmethod
-    def from_others(
-        cls, others: Sequence[PartEstimate], one: PartEstimate, own_offsets: bool = False
-    ) -> Difference:
+    def from_others(cls, others: Sequence[PartEstimate], one: PartEstimate) -> Difference:
         """From what other parts say of one, with what they tell of the common errors, to that one.
 
         All parts are independent but for what they have in common. Where the covariances are known, the
         chi-squared is the :func:`disagreement` of all parts less that of the others. The degrees of freedom
         are Welch's, along the step: those of the side that is known worse count most (Nel and van der Merwe,
         A solution to the multivariate Behrens-Fisher problem, 1986).
-
-        Args:
-            own_offsets: each part has a time offset of its own: only the extrinsics are compared.
         """
         sums = _Sums.joined(_Sums.of_each(others, _names(*others, one)))
-        return cls._from_sums(sums, one, own_offsets)
+        return cls._from_sums(sums, one)
 
     @classmethod
     def each_from_others(cls, parts: Sequence[PartEstimate]) -> list[Difference]:
@@ -105,18 +106,17 @@ class Difference:
         own = _Sums.of_each(parts, _names(*parts))
         before, after = (list(accumulate(each)) for each in (own, reversed(own)))
         others = (_Sums.joined([*before[:k][-1:], *after[: len(own) - k - 1][-1:]]) for k in range(len(own)))
-        return [cls._from_sums(sums, one, False) for sums, one in zip(others, parts, strict=True)]
+        return [cls._from_sums(sums, one) for sums, one in zip(others, parts, strict=True)]
 
     @classmethod
-    def _from_sums(cls, others: _Sums, one: PartEstimate, own_offsets: bool) -> Difference:
-        n, names = 6 if own_offsets else 7, others.names
+    def _from_sums(cls, others: _Sums, one: PartEstimate) -> Difference:
         mean, covariance, _ = others.solved()
-        J = _design(one, names)[:n]
-        step, covariance = one.step[:n] - J @ mean, one.covariance[:n, :n] + J @ covariance @ J.T
+        J = _design(one, others.names)
+        step, covariance = one.step - J @ mean, one.covariance + J @ covariance @ J.T
         along = np.linalg.solve(covariance, step)
         total = max(float(along @ covariance @ along), 1e-300)
         freedom = sum(
-            (float(along @ each[:n, :n] @ along) / total) ** 2 / max(clusters - 1.0, 1.0)
+            (float(along @ each @ along) / total) ** 2 / max(clusters - 1.0, 1.0)
             for each, clusters in ((others.own_covariance, others.clusters), (one.covariance, one.clusters))
         )
         return cls(step, covariance, max(1.0 / freedom, _LEAST_FREEDOM) if freedom > 0.0 else np.inf)
@@ -172,9 +172,9 @@ class _Sums:
     """Normal equations of x and the common errors a by the estimates of parts.
 
     Attributes:
-        around: (7,) the step about which they are written.
+        around: (n,) the step about which they are written.
         names: of the common errors.
-        H, g, constant: (7 + c, 7 + c), (7 + c,) and number of the squared length of d_k - x - S_k a, without
+        H, g, constant: (n + c, n + c), (n + c,) and number of the squared length of d_k - x - S_k a, without
             a' a.
         clusters: of all parts.
     """
@@ -211,22 +211,23 @@ class _Sums:
 
     @property
     def own_covariance(self) -> FloatArray:
-        """(7, 7) of x where the common errors are zero."""
-        return np.asarray(np.linalg.inv(self.H[:7, :7]))
+        """(n, n) of x where the common errors are zero."""
+        n = len(self.around)
+        return np.asarray(np.linalg.inv(self.H[:n, :n]))
 
     def solved(self) -> tuple[FloatArray, FloatArray, float]:
-        """Mean (7 + c,) and covariance of x and the common errors, and the least cost; an error that no
+        """Mean (n + c,) and covariance of x and the common errors, and the least cost; an error that no
         estimate has keeps its one deviation."""
         count = len(self.names)
-        covariance = scaled_inverse(self.H + np.diag([0.0] * 7 + [1.0] * count))
+        covariance = scaled_inverse(self.H + np.diag([0.0] * len(self.around) + [1.0] * count))
         least = covariance @ self.g
         mean = least + np.concatenate([self.around, np.zeros(count)])
         return mean, covariance, self.constant - float(self.g @ least)
 
 
 def _design(estimate: PartEstimate, names: Sequence[str]) -> FloatArray:
-    """(7, 7 + c) derivative of an estimate by x and the common errors."""
-    return np.column_stack([np.eye(7), *(estimate.shift(name) for name in names)])
+    """(n, n + c) derivative of an estimate by x and the common errors."""
+    return np.column_stack([np.eye(len(estimate.step)), *(estimate.shift(name) for name in names)])
 
 
 @dataclass(frozen=True)

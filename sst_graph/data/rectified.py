@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sst_graph.cameras import Rectification
+from sst_graph.cameras import CameraModel, Rectification
 from sst_graph.data.source_view import ChangedSource
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.types import CameraImage, Source
@@ -26,3 +26,10 @@ class RectifiedSource(ChangedSource):
     def changed_image(self, image: CameraImage) -> CameraImage:
         """The image rectified."""
         return self.rectification.image(image)
+
+
+def lens_of(source: Source) -> CameraModel | None:
+    """The model of the camera from whose pictures a source's images are rectified, also where the source is
+    a view of such a one; None where the images are as they came."""
+    rectification = getattr(source, "rectification", None)
+    return rectification.model if isinstance(rectification, Rectification) else None

@@ -35,7 +35,7 @@ def preflight(drives: Sequence[Drive], guess: Guess, classes: Sequence[SemanticC
         found += [clocks.two_clocks(drive), clocks.apart(drive, guess.time_offset_s)]
         found += [clocks.point_times(drive), units.rounding(drive)]
         if classes:
-            found += [labels.ground_points(drive), labels.mask_rows(drive), units.clouds(drive)]
+            found += [labels.ground_points(drive), labels.mask_rows(drive, guess), units.clouds(drive)]
             found.append(labels.copied(drive, guess, classes))
         else:
             found.append(cameras.black_pictures(drive))

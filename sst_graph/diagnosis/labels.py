@@ -15,6 +15,7 @@ from sst_graph.drive.input_statistics import InputStatistics
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import count_of
 from sst_graph.features.mask_shift import MaskShift, mask_shift
+from sst_graph.features.up import LEVEL
 from sst_graph.odometry.lidar import MOVABLE_CLASSES
 from sst_graph.points import transformed_points
 from sst_graph.sampling import step_for
@@ -36,6 +37,8 @@ _SMOOTH = 0.95
 """Share of the points labelled ground on slopes: 0.99 and more of ground, 0.9 and less of other things."""
 _ABOVE = 0.1
 """Ground whose mean row is higher than the vehicles' or the sky's by this share of the image is no ground."""
+_UPRIGHT = 0.7
+"""Cosine between up and the pictures' own from which rows tell what lies above the ground."""
 _COPIED_PAIRS, _COPIED_PX = 12, 4
 """Pairs of scan and image in which copied labels are looked for, and how far from a border [px]."""
 _LEAST_COPIED = 300
@@ -122,21 +125,35 @@ def ground_points(drive: Drive) -> Finding | None:
     )
 
 
-def mask_rows(drive: Drive) -> Finding | None:
-    """Masks whose ground is above their sky or their vehicles."""
-    if drive.statistics is None:
+def mask_rows(drive: Drive, guess: Guess) -> Finding | None:
+    """Masks whose ground is above their sky or their vehicles; below them, in a camera that is mounted upside
+    down by the start. Nothing where the start has up to the side of the pictures, or out of them."""
+    upward = _upward(drive, guess)
+    if drive.statistics is None or abs(upward) < _UPRIGHT:
         return None
     rows = {c: _mean_row(drive.statistics, c) for c in (SemanticClass.GROUND, *_OVER_GROUND)}
-    ground = rows[SemanticClass.GROUND]
+    ground, where = rows[SemanticClass.GROUND], "above" if upward > 0.0 else "below"
     for c in _OVER_GROUND:
         over = rows[c]
-        if ground is not None and over is not None and ground < over - _ABOVE:
+        if ground is None or over is None:
+            continue
+        beyond = float(np.sign(upward)) * (over - ground)
+        if beyond > _ABOVE:
             return Finding(
                 "the class numbers of the masks are mixed up, or the pictures are upside down",
-                f"ground lies {100.0 * (over - ground):.0f} % of the image's height above {c.name.lower()}",
+                f"ground lies {100.0 * beyond:.0f} % of the image's height {where} {c.name.lower()}",
                 "compare the numbers in the masks with their table, and look at an overlay",
             )
     return None
+
+
+def _upward(drive: Drive, guess: Guess) -> float:
+    """Cosine between up, by the ground in the clouds, and up in the pictures, by the start; 1 without one."""
+    if guess.cTl is None:
+        return 1.0
+    ground = usual_ground(drive)
+    up = LEVEL if ground is None else ground.up
+    return float(-guess.cTl.rotation().matrix()[1] @ up)
 
 
 def copied(drive: Drive, guess: Guess, classes: Sequence[SemanticClass]) -> Finding | None:

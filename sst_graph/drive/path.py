@@ -144,6 +144,9 @@ class SensorPath:
             return np.full(len(stamps_ns), -1)
         inside = (self._stamps[0] <= stamps_ns) & (stamps_ns <= self._stamps[-1])
         i = np.clip(np.searchsorted(self._stamps, stamps_ns, side="right") - 1, 0, n - 1)
+        # At a stamp where a failed motion begins, the one that ends there is known.
+        ended = (stamps_ns == self._stamps[i]) & ~self._ok[i]
+        i = np.maximum(i - ended, 0)
         return np.where(inside & self._ok[i], i, -1)
 
     def _interpolated(

@@ -101,7 +101,7 @@ class BasinRun:
 
     Attributes:
         drive: name of the drive.
-        search_deg: half width of the searched rotations [deg].
+        search_deg, search_m: half widths of the searched rotations [deg] and translations [m].
         start_deg: angle between the start and the truth [deg].
         qad_deg, atd_m: errors of the result.
         status: of the result.
@@ -110,6 +110,7 @@ class BasinRun:
 
     drive: str
     search_deg: float
+    search_m: float
     start_deg: float
     qad_deg: float
     atd_m: float
@@ -169,6 +170,7 @@ def _runs_of_drive(task: Task) -> list[BasinRun]:
                 BasinRun(
                     source.name,
                     search_deg,
+                    search_m,
                     float(np.degrees(away)),
                     errors.qad_deg,
                     errors.atd_m,
@@ -226,7 +228,7 @@ def markdown(config: BasinConfig, runs: Sequence[BasinRun]) -> str:
     )
     rows = []
     for search_deg, search_m in zip(config.searches_deg, config.searches_m, strict=True):
-        own = [row for row in runs if row.search_deg == search_deg]
+        own = [row for row in runs if (row.search_deg, row.search_m) == (search_deg, search_m)]
         near = [row for row in own if row.start_deg <= NEAR_DEG]
         label = f"±{search_deg:g}°, ±{search_m:g} m"
         rows.append(_row(label, "all", own, config))

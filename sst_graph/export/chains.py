@@ -99,6 +99,8 @@ def _of_lenses(rig: Rig) -> list[str]:
 
 def _intrinsics(result: CalibrationResult, topic: str, pinhole: bool) -> str:
     camera = EstimatedCamera.of(result)
+    # The pinhole of rectified pictures does not belong to the topic of those that the lens took.
+    images = (result.image_topic or "/" + result.camera_name.lstrip("/")) + "_rectified" * bool(result.lens)
     distortion = ", ".join(numbers([camera.k1, camera.k2, 0.0, 0.0]))
     values = ", ".join(numbers([camera.fx, camera.fy, camera.cx, camera.cy]))
     return (
@@ -107,5 +109,5 @@ def _intrinsics(result: CalibrationResult, topic: str, pinhole: bool) -> str:
         + "  distortion_model: radtan\n"
         + f"  distortion_coeffs: [{distortion}]\n"
         + f"  resolution: [{camera.width}, {camera.height}]\n"
-        + f"  {topic}: {yaml_text(result.image_topic or '/' + result.camera_name.lstrip('/'))}\n"
+        + f"  {topic}: {yaml_text(images)}\n"
     )

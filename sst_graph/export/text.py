@@ -14,6 +14,11 @@ from sst_graph.result import CalibrationResult
 _PLAIN = re.compile(r"[A-Za-z_/][A-Za-z0-9_/.-]*")
 _YAML_WORDS = {"y", "n", "yes", "no", "on", "off", "true", "false", "null"}
 
+RECTIFIED = (
+    "the camera is the pinhole to which sst_graph rectified the pictures of a {lens} lens: the extrinsic "
+    "holds for both, the intrinsics for the rectified pictures alone"
+)
+
 
 def number(value: float) -> str:
     """Shortest text that reads back as the same number; with a point, or YAML 1.1 takes 1e-05 for text."""
@@ -60,6 +65,7 @@ def heading(result: CalibrationResult, frame: str) -> list[str]:
         f"one sigma, about and along the LiDAR's axes: rotation {rx:.3g} {ry:.3g} {rz:.3g} deg, "
         f"translation {x:.3g} {y:.3g} {z:.3g} cm, offset {sigmas.time_offset_ms:.3g} ms",
         *EstimatedCamera.of(result).sentences,
+        *([RECTIFIED.format(lens=result.lens.replace("-", "_"))] if result.lens else []),
     ]
     if result.status != "ok":
         lines.append(f"STATUS {result.status}: these numbers are not to be trusted")

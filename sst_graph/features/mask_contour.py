@@ -34,7 +34,8 @@ class ContourFeet:
         distances: (n,) signed distance, negative inside the mask [px].
         normals: (n, 2) unit normal of the contour, towards the outside.
         feet: (n, 2) nearest point of the contour [px].
-        valid: (n,) False at ridges of the distance, beside ``IGNORE`` pixels and off the image.
+        valid: (n,) False at ridges of the distance, beside ``IGNORE`` pixels, off the image, and beyond the
+            field of the class, where the distance is not known.
     """
 
     distances: FloatArray
@@ -163,7 +164,11 @@ def nearest_contours(
     corners = np.array([(contour.left, contour.top) for contour in contours])
     corner = corners.T if len(contours) == 1 else corners.repeat(counts, axis=0).T
     safe = np.where(valid, uvs.T, BORDER_PX + 1.0)
-    u, v = ((safe - corner)[:, :, None] + _CROSS).astype(np.float32)
+    places = safe - corner
+    sides = np.array([contour.box for contour in contours])
+    sides = sides.T if len(contours) == 1 else sides.repeat(counts, axis=0).T
+    valid &= ((places >= 0.0) & (places <= sides - 1)).all(axis=0)
+    u, v = (places[:, :, None] + _CROSS).astype(np.float32)
     samples = np.empty((n, 5), np.float32)
     for contour, (a, b) in zip(contours, spans, strict=True):
         if b > a:

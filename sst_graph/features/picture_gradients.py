@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sst_graph.features.image_edges import FloatMap, Picture
 from sst_graph.features.mask_contour import ContourFeet, well_inside
-from sst_graph.features.sampling import sampled
+from sst_graph.features.sampling import SAMPLED_ROWS, sampled
 from sst_graph.files.array_store import ArrayStore, shape_of, storable
 from sst_graph.types import FloatArray
 
@@ -119,6 +119,17 @@ class PictureGradients:
             fields.append(cv2.GaussianBlur(small, (0, 0), sigma_px / every) / np.float32(UNIT))
         return np.stack(fields)
 
+    def strengths_at(self, u: FloatMap, v: FloatMap, number: NDArray[np.intp]) -> NDArray[np.uint8]:
+        """(m, n) strengths at columns u and rows v (m, n) across the directions of numbers (n,)."""
+        if DIRECTIONS * self.height < SAMPLED_ROWS:
+            rows = v + (number * self.height).astype(np.float32)
+            return np.asarray(sampled(self.strengths, u, rows), np.uint8)
+        found = np.empty(u.shape, np.uint8)
+        for direction, strengths in enumerate(np.split(self.strengths, DIRECTIONS)):
+            if len(some := np.flatnonzero(number == direction)):
+                found[:, some] = sampled(strengths, u[:, some], v[:, some])
+        return found
+
     @property
     def shape(self) -> tuple[int, ...]:
         """Shape of the strengths, which are not read for it."""
@@ -163,14 +174,13 @@ def profiles(
     # need no limit, the border is repeated there.
     np.maximum(v, np.float32(0.0), out=v)
     np.minimum(v, (height - 1).astype(np.float32), out=v)
-    v += (number * height).astype(np.float32)
     column, row = np.maximum((uvs / 4.0).astype(np.intp).T, 0)
     columns, rows = -(-width // 4), -(-height // 4)
     places = (np.minimum(row, rows - 1) + number * rows) * columns + np.minimum(column, columns - 1)
     # 2. Strengths there, less what is usual nearby.
     for each, (a, b) in zip(gradients, spans, strict=True):
         if b > a:
-            found[:, a:b] = sampled(each.strengths, u[:, a:b], v[:, a:b])
+            found[:, a:b] = each.strengths_at(u[:, a:b], v[:, a:b], number[a:b])
             usual[a:b] = each.usual.take(places[a:b])
     found -= usual
     found /= np.float32(UNIT)

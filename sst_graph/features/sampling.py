@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 
 _REMAP_LIMIT = 30_000
 """OpenCV takes fewer than 32,768 columns."""
+SAMPLED_ROWS = 32_767
+"""A field has fewer rows, and columns, than this: OpenCV's limit."""
 
 
 def sampled(
     field: NDArray[np.float32] | NDArray[np.uint8],
-    u: NDArray[np.float64] | NDArray[np.intp],
-    v: NDArray[np.float64] | NDArray[np.intp],
+    u: NDArray[np.floating[Any]] | NDArray[np.intp],
+    v: NDArray[np.floating[Any]] | NDArray[np.intp],
 ) -> NDArray[Any]:
     """Bilinear values of a field (h, w) or (h, w, k) at columns u and rows v (a, b): (a, b) or (a, b, k).
 

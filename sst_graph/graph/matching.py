@@ -369,7 +369,7 @@ class _Motions:
             return cls(rest, rest, None, rest, since_s)
         measured = l_twists.twists
         l_twists = moved_twists(
-            l_twists, state.nuisances, Scene(drive.camera, measured, 0.0, drive.scan_period_s)
+            l_twists, state.nuisances, Scene(drive.camera, measured, 0.0, drive.lidar_period_s)
         )
         Ad = np.asarray(state.cTl.AdjointMap())
         return cls(l_twists.twists @ Ad.T, l_twists.accelerations @ Ad.T, l_twists, measured, since_s)
@@ -381,7 +381,7 @@ class _Motions:
     def scene(self, drive: Drive, of: IntArray | int) -> Scene:
         """What assumptions depend on, of some of the pairs."""
         since_s = self.since_s[of]
-        return Scene(drive.camera, self.measured[of], since_s, drive.scan_period_s)
+        return Scene(drive.camera, self.measured[of], since_s, drive.lidar_period_s)
 
 
 @dataclass(frozen=True)
@@ -508,11 +508,10 @@ class DriveMatches:
         names = [name for name, _ in named_sigmas(self.edges.config.estimate)]
         if not names:
             return {}
-        pair = self.pair_of
-        base_taus_s = np.array([each.base_tau_s for each in self.pairs])[pair]
+        pair, offsets_s = self.pair_of, self.edges.points.offsets_s[self.points]
         at = self.at.cTl, self.at.time_offset_s, self.c_twists[pair].T
         scene = self.motions.scene(self.edges.drive, pair)
-        return residual_columns(self.alignment, scene, base_taus_s, at, names)
+        return residual_columns(self.alignment, scene, offsets_s, at, names)
 
     def by_pair(self) -> list[PairMatches]:
         """The matches of each pair that has some."""
@@ -526,7 +525,7 @@ class DriveMatches:
         return [self._pair(p, own) for p, own in groups.items()]
 
     def _pair(self, p: int, groups: Mapping[SemanticClass, tuple[slice, int]]) -> PairMatches:
-        objects, motion = self.edges.points.objects, self.motions.of_images(p)
+        points, motion = self.edges.points, self.motions.of_images(p)
         l_twists, tracks = self.motions.l_twists, self.tracks
         return PairMatches(
             self.number,
@@ -536,10 +535,11 @@ class DriveMatches:
             {
                 c: SilhouetteMatches(
                     self._alignment_of(own, motion),
-                    objects[self.points[own]],
+                    points.objects[self.points[own]],
                     self.found.sides[own],
                     self.places[own],
                     self.found.level_px[own],
+                    points.offsets_s[self.points[own]],
                     seen,
                 )
                 for c, (own, seen) in groups.items()

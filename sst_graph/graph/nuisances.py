@@ -68,7 +68,7 @@ def moved_twists(samples: TwistSamples, nuisances: Mapping[str, float], scene: S
 def residual_columns(
     alignment: Alignment,
     scene: Scene,
-    base_tau_s: float | FloatArray,
+    offsets_s: FloatArray,
     pose: tuple[gtsam.Pose3, float, FloatArray],
     names: Sequence[str],
     J: FloatArray | None = None,
@@ -78,13 +78,14 @@ def residual_columns(
     Args:
         alignment: the matches.
         scene: of their scan and image; of several with a row for each match.
-        base_tau_s: stamp of the image minus that of the scan, one for all or (n,) [s].
+        offsets_s: (n,) time of each point relative to its scan's stamp, as it was measured: the intervals of
+            the matches may hold what parameters change [s].
         pose: the extrinsic, the time offset [s], and the camera's twist (6,) or (6, n) [rad/s, m/s].
         names: of the assumptions.
         J: (n, 14) of the residuals by [rot, trans, offset, twist, bias], where it is known; where it is
             weighted, the derivatives are, too.
     """
-    effects = _effects(alignment, scene, base_tau_s, pose, names)
+    effects = _effects(alignment, scene, offsets_s, pose, names)
     # Where pixels move alone, a residual follows its pixel, and the motion's Jacobian is not needed.
     if J is None and not all(map(_moves_pixels_alone, effects)):
         J = residuals(alignment, *pose, 0.0)[1]
@@ -103,11 +104,11 @@ class _Effect:
 def _effects(
     alignment: Alignment,
     scene: Scene,
-    base_tau_s: float | FloatArray,
+    offsets_s: FloatArray,
     pose: tuple[gtsam.Pose3, float, FloatArray],
     names: Sequence[str],
 ) -> list[_Effect]:
-    view = scene.view(alignment.lPs, base_tau_s - alignment.base_taus_s, _pixels(alignment, *pose))
+    view = scene.view(alignment.lPs, offsets_s, _pixels(alignment, *pose))
     seen = np.asarray(np.isfinite(view.uvs).all(axis=1))
     return [_Effect(ASSUMPTIONS[name].effect(view), seen) for name in names]
 

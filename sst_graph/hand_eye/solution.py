@@ -67,7 +67,8 @@ class MotionSolution:
         terms: its pairs, under the noise that the residuals have.
         scales: that noise, in multiples of what odometry states.
         covariance: (7, 7).
-        cost: log of the noise that the residuals have, over all pairs: a negative log-likelihood.
+        cost: log of the noise that the residuals have, over all of the camera's motions, as if those without
+            a pair had the same: a negative log-likelihood.
         outer_iterations: done since the outer loop last began.
         converged: the last step was short.
         iterations: all of them, from the start on.
@@ -198,8 +199,8 @@ def _solve(
         state = state.moved(step)
         iterations.append(OuterIteration(**vars(state.calibration()), kernel_px=None, matches=len(pairs)))
         converged = float(step @ np.linalg.solve(covariance, step)) < STEP_SIGMAS**2
-    misfit = len(terms) * (3.0 * np.log(scales.rotation) + 2.0 * np.log(scales.direction))
-    cost = float(misfit)
+    # Offsets leave different numbers of pairs: a sum over those that there are would reward few.
+    cost = float(len(steps) * (3.0 * np.log(scales.rotation) + 2.0 * np.log(scales.direction)))
     return MotionSolution(state, centre, terms, scales, covariance, cost, outer, converged, tuple(iterations))
 
 

@@ -47,9 +47,9 @@ def pixel_covariance(result: CalibrationResult, cP: FloatArray, pose_H_unknowns:
 
         sigma^2 (J dx/dtheta + e)(J dx/dtheta + e)'
 
-    here, in the place of its share sigma^2 (J dx/dtheta)(J dx/dtheta)' of J P J'. A parameter that is known
-    to be off (:func:`~sst_graph.inspect.considered.covered_errors`) adds theta^2 e e': the step of the
-    estimate is in P already.
+    here, in the place of its share sigma^2 (J dx/dtheta)(J dx/dtheta)' of J P J'. Parameters that are known
+    to be off (:func:`~sst_graph.inspect.considered.covered_errors`) were estimated together, and one may take
+    back what another does: with s = sum theta e they add s s'. The step of the estimate is in P already.
 
     Args:
         cP: (3,) the point, in the camera's frame [m].
@@ -74,11 +74,12 @@ def drawn_covariance(result: CalibrationResult, lP: FloatArray, uv: FloatArray, 
         if shift is not None:
             step, picture = sigma * (J @ sensitivity), sigma * shift
             found += np.outer(step + picture, step + picture) - np.outer(step, step)
+    off = np.zeros(2)
     for name, value in covered_errors(result).items():
         shift = _picture_shift(name, view)
         if shift is not None:
-            found += value**2 * np.outer(shift, shift)
-    return np.asarray(found)
+            off += value * shift
+    return np.asarray(found + np.outer(off, off))
 
 
 def covariance_of_given_lens(result: CalibrationResult) -> FloatArray:

@@ -135,7 +135,7 @@ def plan_recording(result: CalibrationResult, frames: Sequence[FrameInformation]
         for k, frame in enumerate(frames)
     ]
     prior = np.zeros((7, 7))
-    alone = sum((frame.information for frame in frames), prior)
+    alone = _together(result, frames)
     return Plan(
         count,
         predicted(Proposal("now", prior), 0),
@@ -272,6 +272,21 @@ def limits_of(result: CalibrationResult) -> ObservabilityConfig:
         if isinstance(place.get(name), (int, float)) and place[name] > 0
     }
     return dataclasses.replace(ObservabilityConfig(), **given)
+
+
+def _together(result: CalibrationResult, frames: Sequence[FrameInformation]) -> FloatArray:
+    """(7, 7) information of all frames on the extrinsic and the time offset in the result's covariance; of
+    drives with offsets of their own on the extrinsic alone, that offset marginalised out."""
+    own = [drive.drive for drive in result.drive_offsets[:1]]
+    total = np.zeros((7, 7))
+    for name in dict.fromkeys(frame.frame.drive for frame in frames):
+        information = sum((one.information for one in frames if one.frame.drive == name), np.zeros((7, 7)))
+        if own and name not in own:
+            with_prior = information[6, 6] + 1.0 / _vague()[6, 6]
+            information = information - np.outer(information[:, 6], information[6]) / with_prior
+            information[6] = information[:, 6] = 0.0
+        total += information
+    return total
 
 
 def _mean_information(view: FloatArray, twists: FloatArray) -> FloatArray:

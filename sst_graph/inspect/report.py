@@ -19,6 +19,7 @@ from sst_graph.metrics import (
     quaternion_angle_deg,
 )
 from sst_graph.result import CalibrationResult
+from sst_graph.types import FloatArray
 
 OFFSET_SIGN = "t_lidar = t_camera_stamp + offset"
 
@@ -158,7 +159,7 @@ def markdown_report(
             ("", "value", "sigma"),
             [
                 *_euler_rows(result),
-                ("time offset", f"{1e3 * result.time_offset_s:+.2f} ms", _sigma_ms(result)),
+                *_offset_rows(result),
             ],
         ),
         "Roll, pitch and yaw are those of the LiDAR in the camera turned to x forward, y left, z up; "
@@ -235,10 +236,10 @@ def _moved(result: CalibrationResult, initial: gtsam.Pose3) -> str:
 
 
 def _euler_rows(result: CalibrationResult) -> list[tuple[str, str, str]]:
-    """Angles and translation with sigmas about and along the axes they are given in."""
+    """Angles and translation with the sigmas of just these numbers."""
     R = result.T_camera_lidar.rotation().matrix()
     angles = euler_angles_deg(result.T_camera_lidar.rotation())
-    angle_sigmas = result.sigmas().rotation_deg
+    angle_sigmas = _angle_sigmas_deg(angles, result.covariance[:3, :3])
     shift_sigmas = 100.0 * np.sqrt(np.diag(R @ result.covariance[3:6, 3:6] @ R.T))
     rows = [
         (name, f"{angle:.4f} deg", f"{_short(sigma)} deg")
@@ -247,6 +248,33 @@ def _euler_rows(result: CalibrationResult) -> list[tuple[str, str, str]]:
     for name, shift, sigma in zip("xyz", result.T_camera_lidar.translation(), shift_sigmas, strict=True):
         rows.append((name, f"{100.0 * shift:.2f} cm", f"{_short(sigma)} cm"))
     return rows
+
+
+def _offset_rows(result: CalibrationResult) -> list[tuple[str, str, str]]:
+    """The time offset, or that of each drive."""
+    if not result.drive_offsets:
+        return [("time offset", f"{1e3 * result.time_offset_s:+.2f} ms", _sigma_ms(result))]
+    return [
+        (
+            f"time offset of {drive.drive}",
+            f"{1e3 * drive.time_offset_s:+.2f} ms",
+            f"{_short(1e3 * drive.sigma_s)} ms",
+        )
+        for drive in result.drive_offsets
+    ]
+
+
+def _angle_sigmas_deg(angles_deg: FloatArray, covariance: FloatArray) -> FloatArray:
+    """(3,) sigmas of roll, pitch and yaw, by the covariance (3, 3) of turns about the LiDAR's axes [deg].
+
+    With R = Rz(yaw) Ry(pitch) Rx(roll) and R Exp(w): w_x = d roll - sin(pitch) d yaw, w_y = cos(roll) d pitch
+    + cos(pitch) sin(roll) d yaw, w_z = -sin(roll) d pitch + cos(pitch) cos(roll) d yaw.
+    """
+    (sin_r, sin_p, _), (cos_r, cos_p, _) = np.sin(np.radians(angles_deg)), np.cos(np.radians(angles_deg))
+    turns_H_angles = np.array([[1.0, 0.0, -sin_p], [0.0, cos_r, cos_p * sin_r], [0.0, -sin_r, cos_p * cos_r]])
+    # At a pitch of 90 degrees roll and yaw are one turn, which they share.
+    angles_H_turns = np.linalg.pinv(turns_H_angles)
+    return np.degrees(np.sqrt(np.diag(angles_H_turns @ covariance @ angles_H_turns.T)))
 
 
 def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:

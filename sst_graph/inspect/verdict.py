@@ -36,10 +36,12 @@ _MAY_FREE = "joint", "edges", "both"
 
 
 def largest_sigmas(result: CalibrationResult) -> tuple[float, float, float]:
-    """Rotation [deg], translation [cm] and time offset [ms]: one sigma of the worst axis of each."""
+    """Rotation [deg], translation [cm] and time offset [ms]: one sigma of the worst axis of each, and of the
+    worst drive where each has a time offset of its own."""
     covariance = result.covariance
     rotation, translation = (float(np.linalg.eigvalsh(covariance[a : a + 3, a : a + 3])[-1]) for a in (0, 3))
-    return float(np.degrees(np.sqrt(rotation))), 100.0 * np.sqrt(translation), 1e3 * covariance[6, 6] ** 0.5
+    offset_s = max((drive.sigma_s for drive in result.drive_offsets), default=float(covariance[6, 6]) ** 0.5)
+    return float(np.degrees(np.sqrt(rotation))), 100.0 * np.sqrt(translation), 1e3 * offset_s
 
 
 def is_start(result: CalibrationResult) -> bool:
@@ -179,7 +181,11 @@ def _known(result: CalibrationResult) -> str:
     return (
         f"{figure(degrees)}° and {figure(cm)} cm (one sigma): at {one.depth_m:.0f} m the cloud may be "
         f"{figure(one.pixels)} px off in the middle of the picture{corners}. "
-        f"The time offset is known to {figure(ms)} ms."
+        + (
+            f"The time offsets are known to {figure(ms)} ms or better."
+            if len(result.drive_offsets) > 1
+            else f"The time offset is known to {figure(ms)} ms."
+        )
         + (f" {_lens_advice(result)}" if worth_saying and lens else "")
     )
 

@@ -3,6 +3,9 @@
 The centre of an outline wanders over a vehicle while other sides of it come into view, by half a metre a
 second close by. Its end towards the LiDAR along its direction of motion, and its side towards the LiDAR
 across it, are the same parts of it in every scan, as long as it does not pass alongside.
+
+Objects move along the ground. The world's axes, those of the first scan, are taken for level unless the
+LiDAR is clearly mounted aslant (:mod:`sst_graph.features.up`): then outlines are looked at in level axes.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from scipy.spatial.distance import cdist
 
 from sst_graph.drive.preparation import ScanFeatures
 from sst_graph.features.lidar_edges import Boundaries, Edge
+from sst_graph.features.up import LEVEL, levelled, up_direction
 from sst_graph.objects.occupancy import ObjectName
 from sst_graph.odometry.lidar import TESTED_CLASSES
 from sst_graph.types import FloatArray, SemanticClass
@@ -74,6 +78,7 @@ class ObjectVelocities:
     def __init__(self) -> None:
         self._scans: dict[int, _ScanOutlines] = {}
         self.found: dict[int, dict[int, ObjectVelocity]] = {}
+        self._level_R_world: gtsam.Rot3 | None = None
 
     def add(
         self, number: int, scan: ScanFeatures, tracks: Mapping[ObjectName, int], wTl: gtsam.Pose3
@@ -92,7 +97,11 @@ class ObjectVelocities:
     def insert(
         self, number: int, scan: ScanFeatures, tracks: Mapping[ObjectName, int], wTl: gtsam.Pose3
     ) -> None:
-        """Keep a scan's outlines."""
+        """Keep a scan's outlines, in level axes."""
+        if self._level_R_world is None and len(scan.lPs):
+            self._level_R_world = _level_axes(up_direction(scan.lPs), wTl)
+        if self._level_R_world is not None:
+            wTl = gtsam.Pose3(self._level_R_world, np.zeros(3)) * wTl
         self._scans[number] = _ScanOutlines.of(scan, tracks, wTl)
 
     def update_all(self) -> None:
@@ -175,6 +184,13 @@ class ObjectVelocities:
         return ObjectVelocity(here.wTl.rotation().unrotate(np.append(w_velocity, 0.0)), sigma_mps)
 
 
+def _level_axes(l_up: FloatArray, wTl: gtsam.Pose3) -> gtsam.Rot3:
+    """Rotation of the world in axes whose z is up, given in the LiDAR frame of a scan posed at ``wTl``."""
+    if l_up is LEVEL:
+        return gtsam.Rot3()
+    return gtsam.Rot3(levelled(np.eye(3), l_up).T) * wTl.rotation().inverse()
+
+
 def _is_carried(
     w_velocity: FloatArray, outline: FloatArray, times_s: FloatArray, outlines: Sequence[FloatArray]
 ) -> bool:
@@ -193,8 +209,8 @@ def _is_carried(
 
 @dataclass(frozen=True)
 class _ScanOutlines:
-    """A scan: stamp, pose, the LiDAR's place (2,); outlines (n, 2), centres, tracks of movable objects, and
-    their names by track."""
+    """A scan: stamp, pose in level axes, the LiDAR's place (2,); outlines (n, 2), centres, tracks of movable
+    objects, and their names by track."""
 
     stored_apart: ClassVar[bool] = True
 

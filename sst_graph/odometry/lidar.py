@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from sst_graph.config import Settings, setting
 from sst_graph.errors import DataError
+from sst_graph.factors.motion import cross_rows
 from sst_graph.odometry.cloud import (
     FEWEST_POINTS,
     compensate_sweep,
@@ -176,8 +177,7 @@ class LidarOdometry:
             found = self._align(np.concatenate([points, others[parked]]), wTl, seconds)
             if found is None or scan.offsets_s is None or not scan.offsets_s.any():
                 return found
-            change = np.inf if twist is None else np.abs(found.twist - twist)[3:].max()
-            if change * np.abs(scan.offsets_s).max(initial=0.0) < _CONVERGED_M:
+            if twist is not None and _farthest_move(static, found.twist - twist) < _CONVERGED_M:
                 return found
             wTl, twist = found.wTl, found.twist
         return found
@@ -371,6 +371,15 @@ class _Registration:
     cloud: small_gicp.PointCloud
     twist: FloatArray
     covariance: FloatArray
+
+
+def _farthest_move(sweep: _Sweep, twist: FloatArray) -> float:
+    """Farthest that another twist, which differs by this one (6,), moves a point of a sweep [m]."""
+    if sweep.offsets_s is None:
+        return 0.0
+    rates = cross_rows(twist[:3], sweep.points) + twist[3:]
+    moves = sweep.offsets_s**2 * np.einsum("ij,ij->i", rates, rates)
+    return float(np.sqrt(moves.max(initial=0.0)))
 
 
 def registration_covariance(result: small_gicp.RegistrationResult) -> FloatArray:

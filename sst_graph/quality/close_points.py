@@ -17,6 +17,9 @@ from sst_graph.types import FloatArray, IntArray
 
 SIDES_OF_STRETCH = 24
 """Fewest sides of objects that a stretch has, counted in each frame: eight for each angle that is fitted."""
+_LEAST_INDEPENDENT = 6.0
+"""Fewest independent residuals from which a stretch is turned: of fewer, as of one vehicle in all frames,
+three angles leave nothing that tells how the labels err. Those count as they are."""
 _KERNELS_PX = (7.0, 7.0, 5.0, 5.0, 3.0, 3.0)
 """Scales of the robust kernel, iteration by iteration [px]."""
 _GATE_PX = 9.0
@@ -47,7 +50,8 @@ def attainable_share(
         if count > 3:
             turned = r + J @ _best_turn(r, J)
             independent = _independent(turned, sides[stretch])
-            left[stretch] = np.sqrt(independent / (independent - 3.0)) * turned
+            if independent >= _LEAST_INDEPENDENT:
+                left[stretch] = np.sqrt(independent / (independent - 3.0)) * turned
     return close_share(left)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -117,7 +118,7 @@ class FitOfDrives:
         if there is None:
             return 0.0
         close = there.keys[np.abs(there.points.residuals_px) < CLOSE_PX]
-        return len(_rows(close) & _rows(measured.keys)) / len(measured.keys)
+        return (_counts(close) & _counts(measured.keys)).total() / len(measured.keys)
 
 
 def has_edges(drives: Sequence[Drive]) -> bool:
@@ -125,5 +126,6 @@ def has_edges(drives: Sequence[Drive]) -> bool:
     return any(SemanticClass.OBJECT in image.contours for drive in drives for image in drive.images)
 
 
-def _rows(keys: NDArray[np.intp]) -> set[tuple[int, int]]:
-    return {(drive, point) for drive, point in keys.tolist()}
+def _counts(keys: NDArray[np.intp]) -> Counter[tuple[int, int]]:
+    """How often each point (drive, number) is there: once for each image of its scan."""
+    return Counter((drive, point) for drive, point in keys.tolist())

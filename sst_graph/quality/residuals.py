@@ -29,7 +29,8 @@ class Measured:
     Attributes:
         frames: that have points.
         points: of all drives.
-        keys: (n, 2) drive and number of each point among those of the drive, the same under every state.
+        keys: (n, 2) drive and number of each point among those of the drive, the same under every state; a
+            point that several images show is there as often.
     """
 
     frames: tuple[MatchedFrame, ...]

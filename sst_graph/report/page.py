@@ -207,6 +207,8 @@ def _next(inspection: Inspection) -> str:
         short.append(f"{others}.")
     trusted = result.status != "not_converged"
     named = any(inspection.weakest.sentence in reason for reason in [*result.reasons, *weak])
+    # Of the time offsets of several drives the inspection has the first, and another one is past its limit.
+    beside = bool(result.weak_directions) and weakest_ratio(inspection) <= 1.0
     plan = inspection.plan
     advice = [] if plan is None else advice_sentences(inspection, plan)
     rule = general_advice(inspection)
@@ -215,7 +217,9 @@ def _next(inspection: Inspection) -> str:
         "What is weak, and what to record next",
         bullets(short),
         details("The reasons in full", bullets([*result.reasons, *weak])) if result.reasons else "",
-        paragraph(_weakest(inspection)) if trusted and not is_start(result) and not named else "",
+        paragraph(_weakest(inspection))
+        if trusted and not is_start(result) and not named and not beside
+        else "",
         paragraph(
             "What to record next, by the information that the frames of this record gave "
             "(standard deviations, now -> then; x, y and z are the LiDAR's axes):"
@@ -313,7 +317,7 @@ def _named(result: CalibrationResult, fit: Fit, name: str, title: str) -> tuple[
 def _residuals(result: CalibrationResult, fit: Fit) -> str:
     return section(
         *_named(result, fit, "residuals", "Residuals"),
-        grid([*residual_charts(fit), convergence_chart(fit, result), *broad_charts(fit, result.camera)]),
+        grid([*residual_charts(fit), convergence_chart(fit, result), *broad_charts(fit, result)]),
     )
 
 

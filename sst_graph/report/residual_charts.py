@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gtsam
 import numpy as np
 
 from sst_graph.errors import count_of
@@ -10,6 +11,7 @@ from sst_graph.fit import CLOSE_PX, Fit, PointResiduals
 from sst_graph.report.chart import BROAD, Chart
 from sst_graph.report.html import figure, numbered
 from sst_graph.report.overlay import CLASS_NAMES
+from sst_graph.result import CalibrationResult
 from sst_graph.types import BoolArray, FloatArray, IntArray, SemanticClass
 
 _MOST_OBJECTS = 30
@@ -39,7 +41,7 @@ def residual_charts(fit: Fit) -> list[str]:
         ),
         _binned(
             points,
-            np.degrees(np.arctan2(points.lPs[:, 1], points.lPs[:, 0])),
+            _azimuths_deg(points.lPs),
             "azimuth of the LiDAR [deg], left is positive",
             "Over the azimuth",
             _AZIMUTH,
@@ -47,9 +49,16 @@ def residual_charts(fit: Fit) -> list[str]:
     ]
 
 
-def broad_charts(fit: Fit, camera: PinholeCamera) -> list[str]:
+def broad_charts(fit: Fit, result: CalibrationResult) -> list[str]:
     """Charts that are as wide as the page, as figures."""
-    return [_by_object(fit), _over_picture(fit, camera)]
+    return [_by_object(fit, result.T_camera_lidar), _over_picture(fit, result.camera)]
+
+
+def _azimuths_deg(lPs: FloatArray) -> FloatArray:
+    """(n,) azimuths of points (n, 3) without a step among them: past 180 deg where a camera looks back."""
+    x, y, _ = lPs.T
+    azimuths, middle = np.arctan2(y, x), np.arctan2(y.mean(), x.mean())
+    return np.asarray(np.degrees(middle + (azimuths - middle + np.pi) % (2.0 * np.pi) - np.pi))
 
 
 _AZIMUTH = (
@@ -131,13 +140,13 @@ def _by_frame(fit: Fit) -> str:
     )
 
 
-def _by_object(fit: Fit) -> str:
+def _by_object(fit: Fit, cTl: gtsam.Pose3) -> str:
     points = fit.points
     ordered = _objects(points)
     if not ordered:
         return ""
     groups, middles = [own for own, _ in ordered], [middle for _, middle in ordered]
-    names = [f"{_name(points.take(own))}: {middle:+z.2f} px" for own, middle in ordered]
+    names = [f"{_name(points.take(own), cTl)}: {middle:+z.2f} px" for own, middle in ordered]
     most = max(1.0, float(np.abs(middles).max()))
     chart = Chart(
         (0.5, len(groups) + 0.5),
@@ -188,11 +197,11 @@ def mean_residual_px(points: PointResiduals, chosen: IntArray | BoolArray | slic
     return float(np.average(points.residuals_px[chosen], weights=points.weights[chosen] + 1e-9))
 
 
-def _name(points: PointResiduals) -> str:
-    """What an object is, where the LiDAR sees it, and in how many frames."""
-    lP = np.median(points.lPs, axis=0)
-    azimuth = round(float(np.degrees(np.arctan2(lP[1], lP[0]))))
-    side = f"{abs(azimuth)}° {'left' if azimuth > 0 else 'right'}" if azimuth else "ahead"
+def _name(points: PointResiduals, cTl: gtsam.Pose3) -> str:
+    """What an object is, how far from the LiDAR and where before the camera, and in how many frames."""
+    right, _, forward = cTl.transformFrom(np.median(points.lPs, axis=0))
+    aside = round(float(np.degrees(np.arctan2(right, forward))))
+    side = f"{abs(aside)}° {'right' if aside > 0 else 'left'}" if aside else "ahead"
     class_name = CLASS_NAMES[SemanticClass(int(points.classes[0]))]
     frames = count_of(len(np.unique(points.frames)), "frame")
     return (

@@ -141,18 +141,23 @@ def _by_matches(robust: RobustCovariance, pairs: list[PairMatches], root: float)
         "match": (points, model.match, by_match, table.r - frame_mean[which], weights),
     }
     influences = {
-        kind: _sorted(np.asarray(names, np.int64), root * np.sqrt(variance) * steps, means, own)
+        kind: _of_names(np.asarray(names, np.int64), root * np.sqrt(variance) * steps, means, own)
         for kind, (names, variance, steps, means, own) in found.items()
     }
     # Where an edge lies between the rings is the LiDAR's error, whatever the masks of the cameras show.
     scores, none = table.scores, np.zeros(len(sides))
     level = root * scores.level.steps @ gain
-    return influences | {"level": _sorted(np.asarray(scores.sides, np.int64), level, none, none)}
+    return influences | {"level": _of_names(np.asarray(scores.sides, np.int64), level, none, none)}
 
 
-def _sorted(names: IntArray, steps: FloatArray, means: FloatArray, weights: FloatArray) -> Influence:
-    order = np.argsort(names, kind="stable")
-    return Influence(names[order], steps[order], means[order], weights[order])
+def _of_names(names: IntArray, steps: FloatArray, means: FloatArray, weights: FloatArray) -> Influence:
+    """Each error once: that of a point in several images of its scan moves the estimate by all of them."""
+    each, which = np.unique(names, return_inverse=True)
+    which = which.reshape(-1)
+    together = np.zeros((len(each), UNKNOWNS))
+    np.add.at(together, which, steps)
+    weight, mean = _means(means, weights, which, len(each))
+    return Influence(each, together, mean, weight)
 
 
 def _means(
@@ -205,7 +210,10 @@ def _by_motion(robust: RobustCovariance, solution: JointSolution) -> tuple[IntAr
         rows[:, :6] += by_cTl
         rows[:, unknowns.column(clock)] += by_offset
         inverse_root = np.linalg.inv(np.linalg.cholesky(sample.covariance)).T
-        found[_scan_name(pair)] = robust.bread[:UNKNOWNS] @ rows.T @ back @ inverse_root
+        step = robust.bread[:UNKNOWNS] @ rows.T @ back @ inverse_root
+        # All images of a scan are carried by the motion at that scan.
+        name = _scan_name(pair)
+        found[name] = found[name] + step if name in found else step
     names = sorted(found)
     steps = np.stack([found[name] for name in names]) if names else np.zeros((0, UNKNOWNS, 6))
     return np.array(names, np.int64), steps

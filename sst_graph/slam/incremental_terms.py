@@ -196,7 +196,8 @@ class IncrementalTerms:
         warnings = first_warnings
         matches = self._matches()
         if self._kernel_px == self._config.last_px:
-            warnings = warnings + last_warnings(matches, estimate, covariance, self._config)
+            tried = [p.matches for p in self._terms if p.matches is not None and p.matches.place is not None]
+            warnings = warnings + last_warnings(tried, estimate, covariance, self._config)
             point = self._solver.getLinearizationPoint()
             smoother = not isinstance(self._solver, gtsam.ISAM2)
             warnings = warnings + far_linearization(self._keys, matches, point, estimate, smoother)

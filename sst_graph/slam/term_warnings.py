@@ -19,6 +19,9 @@ from sst_graph.types import FloatArray
 MOST_SIGMAS = 4.3
 """An estimate farther from where the other factors have it contradicts them: chi-squared of 7 exceeds its
 square once in a hundred [sigma]."""
+LONGEST_INTERVAL_S = 0.3
+"""Between poses farther apart the motion is hardly steady: braking with 2 m/s^2 puts the interpolated pose
+off by 2 m/s^2 (0.3 s)^2 / 8 = 2 cm in the middle [s]."""
 MOST_LINEAR_PX = 1.0
 """An estimate farther than this from where the solver linearized is not what the matches say [px]."""
 
@@ -30,6 +33,7 @@ class WarningKind(Enum):
     FAR_FROM_START = "the estimate lies farther from where the rest of the graph has it than that allows"
     FAR_LINEARIZATION = "the solver has linearized away from the estimate"
     LEFT_INTERVAL = "stamp + offset has left the interval between its two poses"
+    LONG_INTERVAL = "poses between which the camera's are interpolated lie far apart"
     NO_MATCHES = "terms without a factor"
     NOT_CONVERGED = "matching again still moves the matched points"
     WEAK_DIRECTION = "a combination of extrinsic and time offset that the graph hardly determines"
@@ -155,6 +159,12 @@ def last_warnings(
     left_ms = 1e3 * max((each.left_interval_s(values) for each in matches), default=0.0)
     if left_ms > 0.0:
         warnings.append(TermWarning(WarningKind.LEFT_INTERVAL, left_ms, 0.0, "ms"))
+    interval_s = max((each.place.between.seconds for each in matches if each.place is not None), default=0.0)
+    if interval_s > LONGEST_INTERVAL_S:
+        detail = "add poses by odometry between the keys"
+        warnings.append(
+            TermWarning(WarningKind.LONG_INTERVAL, interval_s, LONGEST_INTERVAL_S, "s", detail)
+        )
     without = sum(each.factor is None for each in matches)
     if without > 0.5 * len(matches):
         warnings.append(TermWarning(WarningKind.NO_MATCHES, without, 0.5 * len(matches), "terms"))

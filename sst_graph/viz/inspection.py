@@ -85,9 +85,12 @@ def draw_correlation(figure: Any, inspection: Inspection) -> Any:
 
 
 def draw_sigma_over_frames(figure: Any, inspection: Inspection) -> Any:
-    """Sigma as frames accumulate, in the record's order."""
+    """Sigma as frames accumulate, in the record's order; the time offset is that of the frame's drive."""
     final = HUMAN * np.sqrt(np.diag(inspection.result.covariance))
     sigmas = np.stack([frame.so_far for frame in inspection.frames]) * final
+    of_drives = {drive.drive: HUMAN[6] * drive.sigma_s for drive in inspection.result.drive_offsets}
+    for k, frame in enumerate(inspection.frames):
+        sigmas[k, 6] = frame.so_far[6] * of_drives.get(frame.frame.drive, final[6])
     count = np.arange(1, len(sigmas) + 1)
     panels = (("rotation [deg]", (0, 1, 2)), ("translation [cm]", (3, 4, 5)), ("time offset [ms]", (6,)))
     axes = figure.subplots(3, 1, sharex=True)

@@ -95,7 +95,7 @@ def truly_seen(name: str, theta: float, a: Alignment, offsets_s: FloatArray) -> 
 def test_the_column_is_the_derivative_of_what_a_broken_assumption_shows(name: str) -> None:
     offsets = np.zeros(40)
     a, step = alignment(points(), offsets), 1e-5 * ASSUMPTIONS[name].span
-    column = residual_columns(a, SCENE, BASE_TAU_S, (cTl, OFFSET_S, C_TWIST), [name])[name]
+    column = residual_columns(a, SCENE, offsets, (cTl, OFFSET_S, C_TWIST), [name])[name]
     plus, minus = (truly_seen(name, sign * step, a, offsets) for sign in (1.0, -1.0))
     np.testing.assert_allclose(column, (plus - minus) / (2.0 * step), rtol=2e-4, atol=1e-4)
 
@@ -103,7 +103,7 @@ def test_the_column_is_the_derivative_of_what_a_broken_assumption_shows(name: st
 def test_points_with_times_miss_a_share_of_them() -> None:
     offsets = np.linspace(-0.05, 0.05, 40)
     a = alignment(points(), offsets)
-    column = residual_columns(a, SCENE, BASE_TAU_S, (cTl, OFFSET_S, C_TWIST), ["sweep"])["sweep"]
+    column = residual_columns(a, SCENE, offsets, (cTl, OFFSET_S, C_TWIST), ["sweep"])["sweep"]
     later, _ = residuals(alignment(points(), 1.001 * offsets), cTl, OFFSET_S, C_TWIST)
     now, _ = residuals(a, cTl, OFFSET_S, C_TWIST)
     np.testing.assert_allclose(column, (later - now) / 0.001, rtol=1e-2, atol=1e-3)

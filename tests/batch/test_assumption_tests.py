@@ -86,6 +86,16 @@ def test_another_optimum_contradicts_nothing(seed: int) -> None:
 
 
 @pytest.mark.slow
+def test_what_cannot_be_tested_is_considered_and_said() -> None:
+    """Three frames with few objects: no estimate of any parameter."""
+    street = simulate(SimulationConfig(seed=7102, frames=3))
+    found = calibrate_prepared(prepare_drives([street], CONFIG), street.nominal, CONFIG)
+    report = found.diagnostics["assumptions"]
+    assert "estimate" not in report["cx"] and report["cx"]["sigma"] > 10.0 * CONFIG.assumptions.cx
+    assert any("too few matches to test focal, cx" in remark for remark in found.diagnostics["remarks"])
+
+
+@pytest.mark.slow
 def test_an_optimum_far_away_is_not_considered() -> None:
     """With every parameter free, wide kernels lead to another pose from these six frames, at which cx would
     be 130 px: that is no deviation to be covered for."""

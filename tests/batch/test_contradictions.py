@@ -374,14 +374,14 @@ def test_only_the_drive_that_is_wrong_is_named() -> None:
     covariance = np.diag([*np.radians([0.02] * 3), *[0.003] * 3, 0.001]) ** 2
     steps = np.random.default_rng(0).multivariate_normal(np.zeros(7), covariance, 4)
     drives = {k: PartEstimate(step, covariance) for k, step in enumerate(steps)}
-    every, apart = compare_drives(drives, False, 1e-3)
+    every, apart = compare_drives(drives, 1e-3)
     assert set(every) == set(drives) and not apart
     for wrong in ([2], [1, 3]):
         turned = {
             k: replace(one, step=one.step + np.radians(0.5 * (k + 1)) * np.eye(7)[0] * (k in wrong))
             for k, one in drives.items()
         }
-        assert sorted(compare_drives(turned, False, 1e-3)[1]) == wrong
+        assert sorted(compare_drives(turned, 1e-3)[1]) == wrong
 
 
 @pytest.mark.slow

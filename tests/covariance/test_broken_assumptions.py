@@ -70,3 +70,11 @@ def test_a_huge_estimate_gives_a_finite_sigma() -> None:
 
 def test_all_assumptions_together_leave_room_for_none_broken() -> None:
     assert 0.0 < sum(each.prevalence for each in ASSUMPTIONS.values()) < 1.0
+
+
+def test_without_evidence_the_variance_is_that_of_both_cases() -> None:
+    """Broken with the prevalence, log-uniform from the prior to the span, whose ends count in full."""
+    none = Evidence.none(K1.prior, K1.span, K1.prevalence)
+    taus = np.geomspace(K1.prior, K1.span, 24)
+    expected = np.sqrt((1.0 - K1.prevalence) * K1.prior**2 + K1.prevalence * (taus**2).mean())
+    assert considered_sigmas({"k1": none})["k1"] == pytest.approx(expected, rel=1e-6)

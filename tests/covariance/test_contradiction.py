@@ -62,7 +62,7 @@ def test_a_direction_that_a_part_does_not_know_does_not_count() -> None:
     assert Difference.of(part(np.zeros(7)), part(step)).p_value < 1e-12
     assert Difference.of(part(np.zeros(7)), part(step, vague)).p_value > 0.99
     # with a time offset each, the extrinsics alone are compared
-    assert Difference.of(part(np.zeros(7)), part(step), own_offsets=True).p_value > 0.99
+    assert Difference.of(part(np.zeros(7)).extrinsic(), part(step).extrinsic()).p_value > 0.99
 
 
 def test_combined_parts_are_weighted_by_their_information() -> None:

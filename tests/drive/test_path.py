@@ -115,6 +115,15 @@ def test_no_path_beyond_the_ends_or_over_a_failure() -> None:
     assert step_of(SensorPath([]), 0, 0) is None
 
 
+@pytest.mark.parametrize("failed", [0, 3, 6])
+def test_with_equal_stamps_only_the_failed_motion_is_lost(failed: int) -> None:
+    """The one before it ends where it begins."""
+    stamps = np.array(evenly(8), np.int64)
+    path = SensorPath([replace(m, ok=k != failed) for k, m in enumerate(motions(weaving, stamps.tolist()))])
+    assert path.steps(stamps[:-1], stamps[1:]).found.tolist() == [k for k in range(7) if k != failed]
+    assert len(path.steps(stamps[:-2], stamps[2:])) == 6 - len({failed - 1, failed} & set(range(6)))
+
+
 def test_noise_between_stamps_by_simulation() -> None:
     """White noise of the poses gives the claimed covariance of a step, at a stamp and between two."""
     rng, sigma = np.random.default_rng(5), np.sqrt(0.5 * COVARIANCE[0, 0])

@@ -61,12 +61,12 @@ def test_bounds_are_those_whose_tails_hold_a_fortieth(count: int, of: int) -> No
 
 def test_failures_and_silent_ones_are_counted() -> None:
     config = BasinConfig()
-    base = BasinRun("a", 180.0, 90.0, 0.1, 0.01, "ok", 2.0)
+    base = BasinRun("a", 180.0, 1.0, 90.0, 0.1, 0.01, "ok", 2.0)
     runs = [
         base,
         dataclasses.replace(base, qad_deg=1.1),
         dataclasses.replace(base, atd_m=0.3, status="not_converged", drive="b"),
-        dataclasses.replace(base, search_deg=30.0, qad_deg=50.0, status="unobservable"),
+        dataclasses.replace(base, search_deg=30.0, search_m=0.6, qad_deg=50.0, status="unobservable"),
     ]
     rows = [line.split(" | ") for line in markdown(config, runs).splitlines() if line.startswith("| ±")]
     assert rows[0][2:4] == ["1", "1 (2.50–100.00 %)"] and rows[0][4].startswith("0 ")
@@ -74,6 +74,17 @@ def test_failures_and_silent_ones_are_counted() -> None:
     assert rows[1][5] == "2 / 0 / 1" and rows[1][6] == "0.100 / 0.100"
     total = markdown(config, runs).splitlines()[-1]
     assert total.startswith("| all | all | 4 | 3 (") and "| 1 (" in total
+
+
+def test_searches_that_differ_in_the_translation_have_rows_of_their_own() -> None:
+    config = BasinConfig(searches_deg=(30.0, 30.0), searches_m=(0.6, 2.0), starts=(1, 1))
+    near = BasinRun("a", 30.0, 0.6, 20.0, 0.1, 0.01, "ok", 2.0)
+    runs = [near, dataclasses.replace(near, search_m=2.0, qad_deg=50.0)]
+    rows = [line.split(" | ") for line in markdown(config, runs).splitlines() if line.startswith("| ±")]
+    assert [(row[0], row[2], row[3][0]) for row in rows] == [
+        ("| ±30°, ±0.6 m", "1", "0"),
+        ("| ±30°, ±2 m", "1", "1"),
+    ]
 
 
 def test_a_number_is_needed_for_every_search() -> None:

@@ -97,6 +97,14 @@ def test_kitti_without_calib_takes_the_camera_for_camera_0(result: CalibrationRe
         assert again.camera(name, 1242, 375) == CAMERA
 
 
+def test_the_pinhole_of_rectified_pictures_is_not_said_of_the_raw_topic(result: CalibrationResult) -> None:
+    raw = {"image_topic": "/front/image_raw"}
+    for lens, topic in (("", "/front/image_raw"), ("plumb_bob", "/front/image_raw_rectified")):
+        text = export_text(dataclasses.replace(result, read_as={**raw, "lens": lens or None}), "kalibr")
+        assert yaml.safe_load(text)["cam0"]["rostopic"] == topic
+        assert ("rectified the pictures of a plumb_bob lens" in text) == bool(lens)
+
+
 def test_kalibr(result: CalibrationResult) -> None:
     cam = yaml.safe_load(export_text(result, "kalibr"))["cam0"]
     np.testing.assert_allclose(np.array(cam["T_cam_imu"]), result.T_camera_lidar.matrix(), atol=1e-15)

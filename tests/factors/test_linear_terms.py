@@ -11,6 +11,7 @@ import pytest
 from sst_graph.factors import (
     Alignment,
     FactorError,
+    GroupedBias,
     LinearTerm,
     PinholeCamera,
     RobustKernel,
@@ -144,3 +145,25 @@ def test_a_point_behind_the_camera_tells_nothing_of_a_term(condensed: bool) -> N
     np.testing.assert_allclose(*hessians, rtol=1e-9, atol=1e-9 * np.abs(hessians[0]).max())
     costs = [factor.error(values_at(theta, 0.0)) for factor in both for theta in (0.3, 0.4)]
     assert costs[1] - costs[0] == pytest.approx(costs[3] - costs[2], rel=1e-9)
+
+
+@pytest.mark.parametrize("condensed", [True, False])
+def test_biases_and_terms_that_share_a_key_add_up(condensed: bool) -> None:
+    """Two objects with one mask bias, and a scalar of which two terms tell: the gradient is that of the
+    cost."""
+    part = silhouettes(3)
+    a, b = np.random.default_rng(8).standard_normal((2, 30))
+    bias = GroupedBias((B, B), np.arange(30) % 2)
+    factor = frame_factor([part], E, D, None, [bias], terms=[[LinearTerm(N, a), LinearTerm(N, b)]])
+    factor = factor if condensed else stacked(factor)
+    values = values_at(0.3, 0.0)
+    graph = gtsam.GaussianFactorGraph()
+    graph.add(factor.linearize(values))
+    gradient = graph.gradientAtZero()
+    for key in (B, N):
+        costs = []
+        for step in (1e-4, -1e-4):
+            moved = gtsam.Values(values)
+            moved.update(key, values.atVector(key) + step)
+            costs.append(factor.error(moved))
+        np.testing.assert_allclose(gradient.at(key), (costs[0] - costs[1]) / 2e-4, rtol=1e-5)

@@ -68,6 +68,17 @@ def test_ridge_border_and_nan_are_not_valid() -> None:
     assert field.look_up(np.array([[46.0, 60.0]])).valid.all()
 
 
+def test_nothing_is_known_beyond_the_field_of_a_class() -> None:
+    """The field ends 64 px around the class; the values at its border are not those of places farther out."""
+    mask = np.zeros((400, 500), np.uint8)
+    mask[150:250, 150:250] = VEHICLE
+    field = ContourMap.of(mask, VEHICLE)
+    assert field is not None
+    far = np.array([[400.0, 300.0], [330.0, 120.0], [120.0, 30.0], [40.0, 290.0]])
+    assert not field.look_up(far).valid.any()
+    assert field.look_up(np.array([[312.0, 240.0], [200.0, 88.0]])).valid.all()
+
+
 def test_contours_beside_ignored_pixels_are_not_valid() -> None:
     mask = disc()
     mask[:, 112:] = SemanticClass.IGNORE

@@ -102,6 +102,19 @@ def test_directions_are_those_of_lines() -> None:
     assert numbers.tolist() == [*range(DIRECTIONS), *range(DIRECTIONS)]
 
 
+def test_pictures_of_4096_rows() -> None:
+    """Eight fields of them, one below the other, have more rows than OpenCV samples at once."""
+    rng = np.random.default_rng(0)
+    tall = rng.integers(0, 255, (4096, 24, 3)).astype(np.uint8)
+    uvs, angles = rng.uniform([6.0, 90.0], [17.0, 150.0], (40, 2)), rng.uniform(0.0, 2.0 * np.pi, 40)
+    outward = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    feet = [
+        nearest_edges([PictureGradients.of(picture)], [(0, 40)], uvs, outward, 2.0).feet
+        for picture in (tall, tall[:300])
+    ]
+    np.testing.assert_allclose(feet[0], feet[1], atol=1e-3)
+
+
 def test_no_edge_where_the_lens_ends() -> None:
     valid = np.ones((120, 160), np.bool_)
     valid[:, 80:] = False

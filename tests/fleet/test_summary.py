@@ -345,6 +345,27 @@ def test_drives_without_dates_count_in_their_order() -> None:
     assert vehicle_of("v", dated, records, WalkConfig()).drives == ("m", "a", "z")
 
 
+def test_one_drive_without_a_date_leaves_no_date_to_a_change() -> None:
+    """The list begins with the later drives: by their dates the step is from v to u, by the list the other
+    way."""
+    listed = {"t": "2026-03-01", "u": "2026-03-08", "v": "2026-01-01", "w": "2026-01-08", "x": ""}
+    drives = [drive(name, "car", date) for name, date in listed.items()]
+    later = result(0).T_camera_lidar.retract(np.radians([0.0, 0.0, 5.0, 0.0, 0.0, 0.0]))
+    records = {
+        name: done(name, replace(result(k), **({"T_camera_lidar": later} if name in "tu" else {})))
+        for k, name in enumerate(listed)
+    }
+    found = vehicle_of("car", drives, records, WalkConfig())
+    assert not found.dated and found.undated == ("x",)
+    (change,) = found.changes
+    assert change.words.startswith("between u and v: rotation by") and "2026" not in change.words
+    assert "no date of x: its drives count in the order of the list" in found.reason
+    dated = vehicle_of("car", drives[:4], records, WalkConfig())
+    assert dated.undated == () and "between w and t (2026-01-08 to 2026-03-01)" in dated.reason
+    in_order = [drives[2], drives[3], drives[0], drives[1], drives[4]]
+    assert vehicle_of("car", in_order, records, WalkConfig()).undated == ()
+
+
 def test_a_record_reads_back() -> None:
     for record in (done("x", result(1)), Record("y", "s3://b/y", "crash", "died", log=("one", "two"))):
         assert Record.from_json(record.to_json().encode(), "record.json") == record

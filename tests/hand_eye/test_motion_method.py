@@ -66,6 +66,21 @@ def test_covariance_fits_the_errors() -> None:
     assert max(nees) < 20.0
 
 
+def swinging(t: float) -> gtsam.Pose3:
+    """Pose at a time [s]: 4 m/s, turning to and fro twice a second."""
+    yaw = 0.05 * np.sin(4.0 * np.pi * t) + 0.02 * np.sin(1.7 * t)
+    rotation = gtsam.Rot3.RzRyRx(0.02 * np.sin(5.0 * t), 0.03 * np.sin(3.1 * t), yaw)
+    return gtsam.Pose3(rotation, np.array([4.0 * t, 0.0, 0.0]))
+
+
+def test_an_offset_that_leaves_few_pairs_gains_nothing_by_them() -> None:
+    """Six pairs that fit badly against eleven that fit better, under more noise than odometry states."""
+    drive = made_drive(swinging, 14, 3, noise=3.0)
+    best, *others = solve_motion([drive], Guess(TRUE), 0.7)
+    assert abs(error_of(best)[6]) < 3e-3
+    assert all(other.cost > best.cost + 20.0 for other in others)
+
+
 def rocking(t: float) -> gtsam.Pose3:
     """Pose at a time [s]: 5 m/s, pitching at 1.3 Hz and, less, at 3.1 Hz, which 10 Hz just shows."""
     pitch = 0.003 * np.sin(2.0 * np.pi * 1.3 * t) + 0.0013 * np.sin(2.0 * np.pi * 3.1 * t + 1.0)

@@ -13,7 +13,7 @@ from sst_graph.factors.camera import PinholeCamera
 from sst_graph.inspect.inspection import inspect_result
 from sst_graph.inspect.inspection_text import inspection_text
 from sst_graph.inspect.misfit import misfits
-from sst_graph.inspect.pixels import covariance_of_given_lens
+from sst_graph.inspect.pixels import covariance_of_given_lens, pixel_covariance, pose_pixel_covariance
 from sst_graph.inspect.verdict import verdict
 from sst_graph.result import CalibrationResult
 
@@ -127,6 +127,24 @@ def test_a_lens_that_is_known_to_be_off_counts_with_its_estimate() -> None:
     assert misfits(by_edges)[1].corner_px > lens_px > 2.0 * misfits(by_labels)[1].corner_px
     refused = replace(by_edges, status="not_converged")
     assert misfits(refused)[1].corner_px == misfits(by_labels)[1].corner_px
+
+
+def test_parameters_of_the_lens_that_are_off_together_may_take_each_other_back() -> None:
+    """A focal length too long by as much as k1 stretches the corner: nothing is off there."""
+    parts = {
+        name: {"sigma": 1e-6, "sensitivity": [0.0] * 7, "estimate": value, "contradicted": True}
+        for name, value in (("focal", -0.01), ("k1", 0.01 / CORNER))
+    }
+    sigmas = [0.1 * DEG] * 3 + [TINY] * 4
+    result = _result(sigmas, method="edges", diagnostics={"assumptions": parts})
+    at_corner = 30.0 * np.array([-620.0 / 700.0, 188.0 / 700.0, 1.0])
+    given, lens = (
+        covariance_of(result, at_corner, np.eye(6, 7))
+        for covariance_of in (pose_pixel_covariance, pixel_covariance)
+    )
+    np.testing.assert_allclose(lens, given, atol=0.05)
+    alone = replace(result, diagnostics={"assumptions": {"focal": parts["focal"]}})
+    assert np.trace(pixel_covariance(alone, at_corner, np.eye(6, 7)) - given) > 6.0**2
 
 
 def test_the_covariance_with_the_lens_that_is_given() -> None:

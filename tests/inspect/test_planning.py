@@ -15,6 +15,7 @@ from sst_graph.files.strict_json import json_able
 from sst_graph.inspect.frame_information import FrameInformation, with_offset
 from sst_graph.inspect.planning import (
     Proposal,
+    _vague,
     considered_covariance,
     driving_axes,
     limits_of,
@@ -24,7 +25,7 @@ from sst_graph.inspect.planning import (
     predict,
     predicted_covariance,
 )
-from sst_graph.result import CalibrationResult, FrameId
+from sst_graph.result import CalibrationResult, DriveOffset, FrameId
 
 CTL = gtsam.Pose3(gtsam.Rot3(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])), np.array([0.0, -0.1, -0.3]))
 """The camera looks along the LiDAR's x axis."""
@@ -231,3 +232,23 @@ def test_limits_of_a_result(config: dict[str, object], expected: object) -> None
     result = CalibrationResult(CTL, 0.0, np.eye(7), "ok", CAMERA, config=config)
     limits = ObservabilityConfig(*expected) if isinstance(expected, tuple) else expected
     assert limits_of(result) == limits
+
+
+def test_frames_of_a_drive_with_another_time_offset_tell_of_the_extrinsic_alone() -> None:
+    """Against extrinsic and both offsets in one matrix."""
+    speeds = [("a", 0.0), ("a", 8.0), *(("b", float(v)) for v in range(12))]
+    view = np.diag(1.0 / np.square([*np.radians([0.3] * 3), 0.05, 0.05, 0.05]))
+    frames, H = [], np.diag(np.append(1.0 / np.diag(_vague()), 1.0 / _vague()[6, 6]))
+    for k, (drive, speed) in enumerate(speeds):
+        twist = np.array([0.0, 0.0, 0.0, speed, 0.0, 0.0])
+        found = FrameInformation(FrameId(drive, k), 1.0, np.ones(7), np.ones(7), view, twist, 90, 4, 6.5, 0.4)
+        J = np.zeros((6, 8))
+        J[:, :6], J[:, 6 if drive == "a" else 7] = np.eye(6), -twist
+        frames, H = [*frames, found], H + J.T @ view @ J
+    covariance = np.linalg.inv(H)[:7, :7]
+    offsets = DriveOffset("a", 0.05, 0.01), DriveOffset("b", 0.02, 0.01)
+    result = CalibrationResult(gtsam.Pose3(), 0.05, 4.0 * covariance, "ok", CAMERA, drive_offsets=offsets)
+    plan = plan_recording(result, frames, 10)
+    np.testing.assert_allclose(plan.elsewhere.sigmas, np.sqrt(np.diag(covariance)), rtol=1e-6)
+    one_clock = plan_recording(replace(result, drive_offsets=()), frames, 10)
+    assert one_clock.elsewhere.sigmas[6] < 0.6 * plan.elsewhere.sigmas[6]

@@ -10,7 +10,7 @@ import pytest
 
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.inspect.report import ReferenceErrors, error_lines, markdown_report, summary
-from sst_graph.metrics import FORWARD_R_OPTICAL, calibration_errors
+from sst_graph.metrics import FORWARD_R_OPTICAL, calibration_errors, euler_angles_deg
 from sst_graph.result import CalibrationResult, DriveOffset, FrameId, WeakDirection
 from sst_graph.types import GroundTruth
 
@@ -30,6 +30,28 @@ RESULT = CalibrationResult(
     initial=POSE * gtsam.Pose3(gtsam.Rot3.Rz(np.radians(5.0)), [0.0, 0.0, 0.0]),
     initial_time_offset_s=0.1,
 )
+
+
+@pytest.mark.parametrize(
+    "rpy_deg", [[2.0, -1.0, 3.0], [90.0, 0.0, 0.0], [5.0, 35.0, -60.0], [175.0, 20.0, 90.0]]
+)
+def test_sigmas_of_roll_pitch_and_yaw_are_those_of_the_angles(rpy_deg: list[float]) -> None:
+    """By differences of the angles themselves, of a LiDAR mounted any way."""
+    R = FORWARD_R_OPTICAL.inverse().compose(gtsam.Rot3.RzRyRx(*np.radians(rpy_deg)))
+    root = (
+        np.random.default_rng(0).normal(size=(7, 7))
+        * np.array([1e-3, 3e-3, 5e-3, 0.01, 0.01, 0.01, 1e-3])[:, None]
+    )
+    result = replace(RESULT, T_camera_lidar=gtsam.Pose3(R, POSE.translation()), covariance=root @ root.T)
+    steps = 1e-6 * np.eye(3)
+    angles_H_turns = [
+        (euler_angles_deg(R.retract(step)) - euler_angles_deg(R.retract(-step))) / 2e-6 for step in steps
+    ]
+    expected = np.sqrt(np.diag(np.transpose(angles_H_turns) @ result.covariance[:3, :3] @ angles_H_turns))
+    rows = [line.split(" | ") for line in markdown_report(result, None, []).splitlines()]
+    said = {row[0]: row[2] for row in rows if len(row) == 3}
+    for name, sigma in zip(("roll", "pitch", "yaw"), expected, strict=True):
+        assert float(said[f"| {name}"].split()[0]) == pytest.approx(sigma, rel=0.05)
 
 
 def test_summary_carries_every_number_with_its_sigma() -> None:
@@ -54,6 +76,10 @@ def test_of_many_reasons_the_summary_has_the_first() -> None:
 def test_summary_names_each_drives_offset() -> None:
     text = summary(replace(RESULT, drive_offsets=(DriveOffset("a/00", -0.05, 0.001),)))
     assert "a/00: -50.00 ms +- 1.0 ms" in text
+    offsets = DriveOffset("a/00", -0.05, 0.001), DriveOffset("b/00", 0.02, 0.012)
+    text = markdown_report(replace(RESULT, drive_offsets=offsets), None, [])
+    assert "| time offset of a/00 | -50.00 ms | 1.0 ms |" in text
+    assert "| time offset of b/00 | +20.00 ms | 12 ms |" in text and "| time offset |" not in text
 
 
 def test_errors_against_the_truth() -> None:

@@ -16,7 +16,7 @@ from sst_graph.inspect.verdict import fit_line, is_start, largest_sigmas, qualit
 from sst_graph.metrics import CalibrationErrors
 from sst_graph.odometry.sweep import REMEDY
 from sst_graph.report import ReportInputs, report_html
-from sst_graph.result import CalibrationResult, FrameId
+from sst_graph.result import CalibrationResult, DriveOffset, FrameId, WeakDirection
 
 CAMERA = PinholeCamera(700.0, 700.0, 620.0, 187.0, 1241, 375)
 OPTICAL = gtsam.Pose3(gtsam.Rot3(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])), np.zeros(3))
@@ -26,6 +26,29 @@ DEG = np.radians(1.0)
 def _result(sigmas: list[float], **values: object) -> CalibrationResult:
     given = {"status": "ok", "camera": CAMERA, **values}
     return CalibrationResult(OPTICAL, 0.1, np.diag(np.square(sigmas)), **given)  # type: ignore[arg-type]
+
+
+def test_the_worst_of_the_time_offsets_of_several_drives_is_told() -> None:
+    offsets = (DriveOffset("a", 0.05, 0.001), DriveOffset("b", 0.02, 0.009))
+    result = _result([1e-3] * 3 + [0.01] * 3 + [0.001], drive_offsets=offsets)
+    assert largest_sigmas(result)[2] == pytest.approx(9.0)
+    assert "The time offsets are known to 9.0 ms or better." in verdict(result)
+    assert "The time offset is known to 1.0 ms." in verdict(replace(result, drive_offsets=()))
+    # The covariance is that of the first drive: it does not say that nothing is past its limit.
+    weak = WeakDirection(
+        np.eye(7)[6], 20.0, "drive 'b': the time offset is known to 20.0 ms only", "record a stop"
+    )
+    past = replace(
+        result,
+        status="unobservable",
+        reasons=(weak.reason,),
+        weak_directions=(weak,),
+        frames_used=(FrameId("a", 0),),
+    )
+    nothing = "No direction is past its limit."
+    assert nothing in report_html(ReportInputs(result, [])) and nothing not in report_html(
+        ReportInputs(past, [])
+    )
 
 
 def test_largest_sigmas_are_those_of_the_worst_direction() -> None:

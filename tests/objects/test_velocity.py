@@ -163,3 +163,25 @@ def test_a_scan_whose_objects_show_no_side() -> None:
     velocities = ObjectVelocities()
     velocities.add(0, dataclasses.replace(scan, boundaries={VEHICLE: roofs}), {NAME: 7}, gtsam.Pose3())
     assert velocities.of(0, NAME) is None and velocities.speeds(0) == {}
+
+
+@pytest.mark.parametrize("pitch_deg", [0.0, 25.0])
+def test_a_box_on_the_ground_seen_by_a_lidar_that_is_mounted_aslant(pitch_deg: float) -> None:
+    """The world's axes are those of the first scan, aslant too: the velocity has a part along their z."""
+    velocities, level_R_world = ObjectVelocities(), gtsam.Rot3.Pitch(np.radians(pitch_deg))
+    rng = np.random.default_rng(0)
+    ground = np.column_stack([rng.uniform(-5.0, 40.0, (3000, 2)), rng.normal(-1.7, 0.02, 3000)])
+    for k in range(12):
+        t = 0.1 * k
+        level_T_lidar = gtsam.Pose3(level_R_world, np.array([2.0 * t, 0.0, 0.0]))
+        corners = _seen_corners(np.array([15.0 + 10.0 * t, 3.0]), np.array([2.0 * t, 0.0]))
+        scan = _scan(k * PERIOD_NS, level_T_lidar, corners)
+        lPs = (ground - level_T_lidar.translation()) @ level_R_world.matrix()
+        scan = dataclasses.replace(scan, lPs=lPs, classes=np.ones(3000, np.uint8))
+        velocities.insert(
+            k, scan, {NAME: 7}, gtsam.Pose3(level_R_world, np.zeros(3)).inverse() * level_T_lidar
+        )
+    velocities.update_all()
+    found = velocities.of(6, NAME)
+    assert found is not None
+    np.testing.assert_allclose(level_R_world.rotate(found.l_velocity), [10.0, 0.0, 0.0], atol=0.05)

@@ -71,3 +71,20 @@ def test_few_sides_are_made_up_for() -> None:
         found.append(attainable_share(r[few], by_turn[few], frames[few], sides[few]))
         truth.append(close_share(r[few]))
     assert np.mean(found) == pytest.approx(np.mean(truth), abs=0.015)
+
+
+def test_a_single_vehicle_leaves_what_labels_allow_at_what_they_show() -> None:
+    """Left, right and lower edge of one vehicle in all frames, each drawn 0.8 px too far out: three angles
+    take as many independent residuals as there are."""
+    sides = np.tile(np.repeat(np.arange(3), 20), 12)
+    normals = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0]])[sides]
+    uvs = np.array([[40.0, 0.0], [-40.0, 0.0], [0.0, 20.0]])[sides]
+    r = 0.8 + np.random.default_rng(0).normal(0.0, 0.2, len(sides))
+    by_turn = np.stack(
+        [normals[:, 1] * 720.0, normals[:, 0] * 720.0, (normals * uvs[:, ::-1] * [-1, 1]).sum(1)], 1
+    )
+    frames = np.repeat(np.arange(12), 60)
+    assert close_share(r) > 0.99
+    assert attainable_share(r, by_turn, frames, sides) > 0.99
+    two = sides < 2
+    assert attainable_share(r[two], by_turn[two], frames[two], sides[two]) > 0.99

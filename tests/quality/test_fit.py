@@ -9,12 +9,13 @@ from functools import cache
 import gtsam
 import numpy as np
 import pytest
-from stored import stored
-from streets import CROWDED_STREET, crowded_street
+from stored import simulated, stored
+from streets import CROWDED_STREET, HALF_SIZE, crowded_street
 
 from sst_graph.batch import CalibrationConfig
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.batch.problem import CalibrationProblem
+from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import Drive
 from sst_graph.fit import Fit, FitQuality
 from sst_graph.graph.outer_loop import NARROW_KERNELS_PX, JointSolution, solve_joint
@@ -152,3 +153,19 @@ def test_quality_is_read_back_and_nonsense_is_not() -> None:
     ):
         assert FitQuality.from_diagnostics({"fit_quality": {**quality.to_dict(), **wrong}}) is None
     assert FitQuality.from_diagnostics({"fit_quality": 3}) is None
+
+
+def test_the_start_has_its_share_of_points_that_several_images_show() -> None:
+    """A camera three times as fast as the LiDAR: at the very start the two shares are one."""
+    config = replace(HALF_SIZE, seed=3, frames=6, frame_rate_hz=30.0, time_offset_s=0.03, motion="no_stop")
+    kept = KeptDrive.of(simulated(config))
+    frames = tuple(one if k % 3 == 0 else replace(one, scan=None) for k, one in enumerate(kept.frames))
+    (drive,) = prepare_drives([replace(kept, frames=frames)], CONFIG)
+    assert drive.has_dense_images and kept.truth is not None
+    problem = CalibrationProblem.of([drive], Guess(kept.truth.cTl, 0.03), CONFIG)
+    of_drives = FitOfDrives([drive], problem.motions, problem.objects, problem.config.joint.graph)
+    state = State(kept.truth.cTl, (0.03,))
+    measured = of_drives.measured(state)
+    assert measured is not None and len(np.unique(measured.keys, axis=0)) < 0.6 * len(measured.keys)
+    quality = of_drives.quality(measured, state)
+    assert quality.share_at_start == quality.share > 0.5

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sst_graph.covariance.shared_errors import FEWEST, SharedErrors
-from sst_graph.rig.influences import KINDS, CameraInfluences, Influence
+from sst_graph.rig.influences import KINDS, CameraInfluences, Influence, _of_names
 from sst_graph.rig.joint_covariance import joint_covariance
 
 NAMES = np.arange(40)
@@ -70,6 +70,20 @@ def test_errors_that_are_alike_in_part() -> None:
     assert rho == pytest.approx(0.5, abs=0.05)
     expected = rho * one.matches["side"].steps.T @ other.matches["side"].steps
     np.testing.assert_allclose(matrix[:7, 7:], expected, rtol=1e-6, atol=1e-12)
+
+
+def test_a_point_in_several_images_of_its_scan_is_one_error() -> None:
+    """It moves the estimate by all of them, its residual is their weighted mean."""
+    found = _of_names(
+        np.array([7, 3, 7]),
+        np.arange(21.0).reshape(3, 7),
+        np.array([1.0, 5.0, 4.0]),
+        np.array([2.0, 1.0, 1.0]),
+    )
+    np.testing.assert_array_equal(found.names, [3, 7])
+    np.testing.assert_array_equal(found.steps, [np.arange(7.0, 14.0), np.arange(7.0) + np.arange(14.0, 21.0)])
+    np.testing.assert_allclose(found.means, [5.0, 2.0])
+    np.testing.assert_array_equal(found.weights, [1.0, 3.0])
 
 
 def test_other_objects_are_independent() -> None:

@@ -12,6 +12,7 @@ import pytest
 from rigs import stereo
 from stored import stored
 from streets import CROWDED_STREET as STREET
+from streets import HALF_SIZE
 
 from sst_graph import CalibrationConfig, calibrate
 from sst_graph.config import with_overrides
@@ -267,6 +268,23 @@ def test_settings_that_a_rig_has_not(overrides: list[str], found: str) -> None:
 def test_what_is_no_rig_is_refused(given: dict, found: str) -> None:
     with pytest.raises((SstGraphError, FactorError), match=found):
         calibrate_rig(**{"cameras": dict(rig()), **given})
+
+
+@pytest.mark.slow
+def test_cameras_that_are_faster_than_the_lidar() -> None:
+    """Several images of each scan show a boundary point: it is one error that the cameras have in common."""
+    street = replace(HALF_SIZE, seed=3, frames=12, frame_rate_hz=30.0, time_offset_s=0.03, motion="no_stop")
+    cameras, guesses = {}, {}
+    for name, drive in stereo(street).items():
+        kept, guesses[name] = KeptDrive.of(drive), Guess(drive.truth.cTl, 0.03)
+        frames = [one if k % 3 == 0 else replace(one, scan=None) for k, one in enumerate(kept.frames)]
+        cameras[name] = [replace(kept, frames=tuple(frames))]
+    config = CalibrationConfig(use_motion="never")
+    prepared = prepare_rig(cameras, config)
+    assert all(drive.has_dense_images for own in prepared.values() for drive in own)
+    found = calibrate_rig_prepared(prepared, guesses, config, KnownRig())
+    sigmas = np.sqrt(np.diag(found.covariance))
+    assert 0.1 < (found.covariance / np.outer(sigmas, sigmas))[0, 7] < 1.0
 
 
 @pytest.mark.slow

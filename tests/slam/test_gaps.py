@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -144,3 +145,18 @@ def test_a_term_before_the_trajectory_waits(street: Street, kind: str) -> None:
         told.add(time_offset_prior(D, street.time_offset_s, 1e-4))
         after = online.terms.update(told, gtsam.Values())
         assert not after.waiting and (after.rematched > 0) == waits
+
+
+def test_images_that_show_nothing_are_said(street: Street) -> None:
+    """Most of a window without a factor: the estimate lives on what has left."""
+    empty = tuple(image.with_contours({}) for image in street.images)
+    blind = replace(street, images=street.images[:7] + empty[7:])
+    online = Online(blind, (street.cTl, street.time_offset_s))
+    for k in range(8):
+        online.update(k)
+    seen = online.converge()
+    for k in range(8, 12):
+        online.update(k)
+    blinded = online.converge()
+    assert WarningKind.NO_MATCHES not in kinds(seen)
+    assert WarningKind.NO_MATCHES in kinds(blinded)

@@ -20,7 +20,7 @@ from sst_graph.slam.alignment_term import TermConfig, TermMatches, TermState
 from sst_graph.slam.config import RematchConfig
 from sst_graph.slam.incremental_terms import IncrementalTerms, Solver
 from sst_graph.slam.solving import RematchSolution, match_all
-from sst_graph.slam.term_warnings import WarningKind
+from sst_graph.slam.term_warnings import WarningKind, last_warnings
 from sst_graph.types import SemanticClass
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -219,6 +219,16 @@ def test_a_term_moves_to_the_poses_of_its_time(street: Street) -> None:
     again = term.matched(values, 5.0)
     assert again.place is not None and (again.place.between.X_a, again.place.between.X_b) == (X(6), X(7))
     assert again.left_interval_s(values) == 0.0
+
+
+def test_poses_that_lie_far_apart_are_said(street: Street) -> None:
+    _, values = street.whole((street.cTl, street.time_offset_s))
+    for every, expected in ((2, False), (4, True)):
+        frames = range(0, len(street.stamps_ns), every)
+        trajectory = Trajectory([X(k) for k in frames], [street.stamps_ns[k] for k in frames])
+        matches = street.term(4, AlignmentKeys(trajectory, E, D)).matched(values, 5.0)
+        found = last_warnings([matches], values, np.zeros((7, 7)), RematchConfig())
+        assert (WarningKind.LONG_INTERVAL in {each.kind for each in found}) == expected
 
 
 def test_the_scan_nearest_in_true_time_is_taken(street: Street) -> None:

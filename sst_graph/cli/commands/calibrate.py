@@ -17,7 +17,7 @@ from sst_graph.cli.messages import complain, mention, say
 from sst_graph.cli.output_places import check_apart
 from sst_graph.cli.outputs import CALIBRATION, comparison, exit_code, result_numbers, write_calibration
 from sst_graph.cli.progress import ProgressBar
-from sst_graph.cli.reading import given_cameras, options_of, warn_of_other_pairs, with_image_topic
+from sst_graph.cli.reading import given_cameras, options_of, warn_of_other_pairs, with_images_read
 from sst_graph.cli.rig import refuse_rig_options, run_rig
 from sst_graph.cli.video import videos_beside
 from sst_graph.data.info.needed_labels import require_labels
@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
             warn_of_other_pairs(args.init, read_as)
             initial, time_offset_s = starting_point(args.init, sources[0], args.camera)
             result, against = calibrate_drives(sources, initial, time_offset_s, config, args.camera)
-            result = dataclasses.replace(result, read_as=with_image_topic(read_as, sources))
+            result = dataclasses.replace(result, read_as=with_images_read(read_as, sources))
             # The numbers first: what follows may find the disk full.
             if not args.json:
                 mention(verdict_and_summary(result, against))

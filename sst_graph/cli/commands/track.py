@@ -19,7 +19,7 @@ from sst_graph.cli.labels import check_classes
 from sst_graph.cli.messages import complain, say
 from sst_graph.cli.output_places import CHECKPOINT_FILE, RERUN_FILE, RESULT_FILE, check_apart
 from sst_graph.cli.progress import ProgressBar, counted
-from sst_graph.cli.reading import open_drive, options_of, warn_of_other_pairs, with_image_topic
+from sst_graph.cli.reading import open_drive, options_of, warn_of_other_pairs, with_images_read
 from sst_graph.errors import ConfigError
 from sst_graph.files import output_file
 from sst_graph.odometry.sweep import SWEEP_KEY, SweptSource, with_sweep
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
         if recorded is not None:
             recorded.publish()
         result = _with_decision(tracker.result(source.name, args.camera), source)
-        result = dataclasses.replace(result, read_as=with_image_topic(read_as, [source]))
+        result = dataclasses.replace(result, read_as=with_images_read(read_as, [source]))
         if out is not None:
             out.write_text(result.to_json())
     return _verdict(last, result)

@@ -34,7 +34,7 @@ class Change:
 
     Attributes:
         after, before: names of the last drive before it and of the first drive after it.
-        since, until: dates of the two, or empty.
+        since, until: dates of the two, or empty where not all drives of the vehicle have one.
         finding: the test.
         drives: how many drives of the stretches on either side; a side of one drive cannot tell a change from
             a bad drive.
@@ -74,6 +74,8 @@ class Vehicle:
         weak: what the calibration does not determine to within the limits, the weakest first.
         dated: whether all have a date; else their order counts, a day from each to the next.
         cameras: names of the cameras of those that count.
+        undated: names of those without a date, where the order of the list is not that of the dates of the
+            others.
     """
 
     name: str
@@ -88,6 +90,7 @@ class Vehicle:
     dated: bool
     weak: tuple[WeakDirection, ...] = ()
     cameras: tuple[str, ...] = ()
+    undated: tuple[str, ...] = ()
 
     @property
     def reason(self) -> str:
@@ -99,6 +102,11 @@ class Vehicle:
             parts.append(
                 f"its drives name {count_of(len(self.cameras), 'camera')} ({', '.join(self.cameras)}), which "
                 "are fused as one: make a vehicle of each, unless all of them are names of one"
+            )
+        if self.undated:
+            parts.append(
+                f"no date of {', '.join(self.undated)}: its drives count in the order of the list, which is "
+                "not that of the dates of the others"
             )
         if self.calibration is None:
             parts.append("no drive of it has a result that counts")
@@ -136,7 +144,7 @@ def vehicle_of(
     found = find_changes(estimates, config)
     drift = smoothed(found.left, found.steps, config)
     by_name = {drive.name: drive for drive in counted}
-    changes = _changes(found, by_name)
+    changes = _changes(found, by_name, dated)
     last = drift[-1]
     calibration = Smoothed(*last, covariance=last.covariance + last.common)
     weak = weak_directions(calibration.covariance, calibration.cTl, limits)
@@ -156,6 +164,7 @@ def vehicle_of(
         dated,
         weak,
         tuple(sorted({_numbers(records, drive.name).camera for drive in counted})),
+        _undated(counted),
     )
 
 
@@ -278,15 +287,20 @@ def _numbers(records: Mapping[str, Record], name: str) -> Numbers:
     return numbers
 
 
-def _changes(found: Findings, drives: Mapping[str, ListedDrive]) -> tuple[Change, ...]:
+def _undated(drives: Sequence[ListedDrive]) -> tuple[str, ...]:
+    """Names of the drives without a date, where the days of the others do not rise in their order."""
+    days = [drive.day for drive in drives if drive.day is not None]
+    return () if days == sorted(days) else tuple(drive.name for drive in drives if drive.day is None)
+
+
+def _changes(found: Findings, drives: Mapping[str, ListedDrive], dated: bool) -> tuple[Change, ...]:
     names = [one.name for one in found.left]
     borders = [0, *sorted(found.steps), len(names)]
     sizes = {
         at: (at - start, end - at) for start, (at, end) in zip(borders, pairwise(borders[1:]), strict=False)
     }
+    dates = [drives[name].date if dated else "" for name in names]
     return tuple(
-        Change(
-            names[k - 1], names[k], drives[names[k - 1]].date, drives[names[k]].date, found.steps[k], sizes[k]
-        )
+        Change(names[k - 1], names[k], dates[k - 1], dates[k], found.steps[k], sizes[k])
         for k in sorted(found.steps)
     )

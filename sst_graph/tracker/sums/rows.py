@@ -127,9 +127,9 @@ def _of_class(pairs: Sequence[PairAt], c: SemanticClass) -> list[Rows]:
     roots, known = np.abs(J[:, 13]) * alignment.sigmas_px, np.zeros((0, len(r)))
     if assumptions:
         twists = np.repeat([one.pair.motion.c_twist for one in pairs], counts, axis=0)
-        base_taus_s = np.repeat([one.pair.pair.base_tau_s for one in pairs], counts)
+        offsets_s = np.concatenate([one.pair.matches[c].offsets_s for one in pairs])
         at, scene = (point.cTl, point.time_offset_s, twists.T), _scene(pairs, counts)
-        known = np.array([*residual_columns(alignment, scene, base_taus_s, at, assumptions, J).values()])
+        known = np.array([*residual_columns(alignment, scene, offsets_s, at, assumptions, J).values()])
     assert alignment.normals is not None
     by_picture = J[:, 13:14] * alignment.normals
     ends = np.cumsum(counts).tolist()

@@ -39,6 +39,8 @@ _MIN_MATCHES = 8
 """Fewest matches of a scan that enters the graph: fewer hardly determine anything."""
 _SMOOTHED = 12
 """So many of the latest motions are smoothed again with every scan."""
+_OF_EACH_MATCH = ("objects", "sides", "index", "level_px", "offsets_s")
+"""The arrays of matches that have a row for each."""
 
 
 @dataclass(frozen=True)
@@ -178,7 +180,7 @@ class WindowMatcher:
         for c, m in pair.matches.items():
             kept = np.flatnonzero([tracks[c, int(name)] not in out for name in m.objects])
             if len(kept):
-                part = {name: getattr(m, name)[kept] for name in ("objects", "sides", "index", "level_px")}
+                part = {name: getattr(m, name)[kept] for name in _OF_EACH_MATCH}
                 matches[c] = replace(m, alignment=m.alignment.take(kept), **part)
                 if c in pair.tracks:
                     own[c] = pair.tracks[c][kept]

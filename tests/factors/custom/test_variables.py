@@ -315,7 +315,7 @@ def test_a_class_may_be_asked_for(kind):
         factor.error(other)
 
 
-@pytest.mark.parametrize("kind", [0, -1, None, "6", 2.5, True, list, gtsam.NonlinearFactorGraph])
+@pytest.mark.parametrize("kind", [0, -1, None, "6", 2.5, True, float, int, list, gtsam.NonlinearFactorGraph])
 def test_what_is_no_kind_of_variable_is_refused(kind):
     with pytest.raises(FactorError, match="kind of a variable"):
         custom_factor(
