@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeGuard
 
 import gtsam
 import numpy as np
@@ -202,13 +202,15 @@ def checked_count(what: str, value: int, expected: str = "a whole number above 0
     return int(value)
 
 
+_NO_NUMBERS = (bool, np.timedelta64)
+"""Kinds of whole numbers to Python and NumPy that are none to a reader."""
 _MAX_COUNT = 2**31 - 1
 """gtsam counts rows and dimensions with ints of 32 bits."""
 
 
-def is_whole(value: Any) -> bool:
-    """Whether ``value`` is of an integer type; True and False are not."""
-    return isinstance(value, int | np.integer) and not isinstance(value, bool)
+def is_whole(value: Any) -> TypeGuard[int]:
+    """Whether ``value`` is of an integer type; True, False and durations of NumPy are not."""
+    return isinstance(value, int | np.integer) and not isinstance(value, _NO_NUMBERS)
 
 
 def _is_finite(value: Any) -> bool:
@@ -216,7 +218,7 @@ def _is_finite(value: Any) -> bool:
         if masked_values(value):  # hides a number, and is NaN as a float
             return False
         value = value.item()
-    if not isinstance(value, int | float | np.integer | np.floating) or isinstance(value, bool):
+    if not isinstance(value, int | float | np.integer | np.floating) or isinstance(value, _NO_NUMBERS):
         return False
     try:
         return math.isfinite(value)

@@ -127,7 +127,7 @@ def checked_scan(scan: object, place: str = "scan", fewest: int = 1) -> Scan:
         times = _array(scan.offsets_s, (n,), f"{place}: point times")
         offsets_s = _reals(times, LONGEST_SWEEP_S, f"{place}: point times", "s after the stamp")
     left_out = scan.left_out
-    if not isinstance(left_out, int | np.integer) or left_out < 0:
+    if not is_whole(left_out) or left_out < 0:
         raise DataError(f"{place}: left_out", described(left_out), "a number of points")
     return Scan(stamp_ns, points, classes, instances, offsets_s, rings, int(left_out))
 
@@ -182,7 +182,7 @@ def checked_index(index: object, place: str = "frame") -> int:
     Raises:
         DataError: it is no whole number, or one that does not fit into int64.
     """
-    if not isinstance(index, int | np.integer) or isinstance(index, bool):
+    if not is_whole(index):
         raise DataError(place, f"an index that is a {type(index).__name__}", "a whole number")
     if abs(int(index)) > LATEST_NS:
         raise DataError(place, "an index of more than 19 digits", "a number of a frame")
@@ -219,7 +219,8 @@ def checked_guess(initial: object, time_offset_s: object) -> tuple[gtsam.Pose3 |
 
 def _number(value: object, place: str) -> float:
     """A finite number as a plain float."""
-    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+    numbers = int | float | np.integer | np.floating
+    if isinstance(value, bool | np.timedelta64) or not isinstance(value, numbers):
         raise DataError(place, f"a {type(value).__name__}", "a number")
     try:
         number = float(value)
@@ -238,7 +239,7 @@ def _stretch(stretch: object, place: str) -> PixelStretch:
     if min(squares.shape[:2]) < 2:
         raise DataError(f"{place}: squares", f"shape {squares.shape}", "at least 2 rows and columns")
     step = stretch.step_px
-    if not isinstance(step, int | np.integer) or isinstance(step, bool) or not 1 <= step <= LATEST_NS:
+    if not is_whole(step) or not 1 <= step <= LATEST_NS:
         raise DataError(f"{place}: step_px", f"{step!r:.60}", "a whole number of pixels, 1 or more")
     checked = _reals(squares, MOST_STRETCH**2, f"{place}: squares", "px^2 a px^2")
     return stretch if checked is stretch.squares and type(step) is int else PixelStretch(checked, int(step))
@@ -261,7 +262,7 @@ def checked_stamp(stamp_ns: object, place: str) -> int:
     Raises:
         DataError: it is no whole number, or one that no clock shows.
     """
-    if not isinstance(stamp_ns, int | np.integer) or isinstance(stamp_ns, bool):
+    if not is_whole(stamp_ns):
         raise DataError(place, f"a stamp that is a {type(stamp_ns).__name__}", "whole nanoseconds")
     if abs(int(stamp_ns)) > LATEST_NS:
         raise DataError(place, "a stamp of more than 146 years", "nanoseconds that fit into int64")

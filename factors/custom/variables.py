@@ -206,7 +206,7 @@ def dimension(kind: Kind) -> int:
     if isinstance(kind, Vector):
         return kind.size
     if isinstance(kind, type):
-        if issubclass(kind, int | float):
+        if kind in (bool, int, float):
             raise FactorError("kind of a variable", kind.__name__, "1, the dimension of a double")
         return _class_dimension(kind)
     return checked_count("kind of a variable", kind, "a dimension above 0, a class, or Vector(n)")

@@ -10,6 +10,11 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TextIO
 
+from sst_graph.factors.errors import printable
+
+_LONGEST_REMARK = 4800
+"""Characters of a remark on stderr."""
+
 
 class StreamError(Exception):
     """stdout does not take what was written to it.
@@ -81,8 +86,8 @@ def _discard_stdout() -> None:
 
 
 def complain(text: str) -> None:
-    """One line on stderr, whatever the text holds."""
-    _on_stderr("sst-graph: " + " ".join(text.split()) + "\n")
+    """One printable line on stderr, whatever the text holds."""
+    _on_stderr("sst-graph: " + printable(" ".join(text.split()), _LONGEST_REMARK) + "\n")
 
 
 def _on_stderr(text: str) -> None:

@@ -27,6 +27,12 @@ _PREFIXES = (
     "[ WARN",
     "[ERROR",
     "[ INFO",
+    # OpenCV's checks: several lines for one that fails
+    "> ",
+    "where",
+    "must be ",
+    "    '",
+    "OpenCV(",
 )
 """How the decoders' lines begin."""
 

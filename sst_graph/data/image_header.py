@@ -27,6 +27,8 @@ _COLOUR_TYPE, _OF_PALETTE = 25, 3
 """Where the header of a PNG file says what its pixels are, and that of indices."""
 _STANDALONE = {0x01, *range(0xD0, 0xD8)}
 _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
+_MAX_SCANS = 100
+"""Of a JPEG picture; encoders make ten."""
 
 
 def image_size(data: bytes, path: str | Path) -> tuple[int, int]:
@@ -116,6 +118,9 @@ def _jpeg_segments(data: bytes) -> list[tuple[int, int, int]]:
 def _check_jpeg_end(data: bytes, path: str | Path) -> None:
     """An end of image behind the first scan: a preview in the header has one of its own."""
     scans = [start for marker, start, _ in _jpeg_segments(data) if marker == _START_OF_SCAN]
+    # Each scan takes the time of the whole picture, however short it is; within one, 0xFF is followed by 0.
+    if scans and (count := data.count(bytes((0xFF, _START_OF_SCAN)), scans[0])) >= _MAX_SCANS:
+        raise DataError(path, f"{count_of(count, 'scan')} of one JPEG picture", f"less than {_MAX_SCANS}")
     if not scans or data.find(bytes((0xFF, _END_OF_IMAGE)), scans[0]) < 0:
         raise DataError(path, "a truncated JPEG file", "an end-of-image marker")
 
@@ -143,6 +148,7 @@ def _check_png_chunks(data: bytes, path: str | Path) -> None:
 
 _WIDTH, _HEIGHT, _BITS, _CHANNELS = 256, 257, 258, 277
 _STRIPS, _STRIP_BYTES, _TILES, _TILE_BYTES = 273, 279, 324, 325
+_USED = frozenset((_WIDTH, _HEIGHT, _BITS, _CHANNELS, _STRIPS, _STRIP_BYTES, _TILES, _TILE_BYTES))
 _FORMATS = {3: ("H", 2), 4: ("I", 4)}
 """Of SHORT and LONG values."""
 _MAX_VALUES = 1_000_000
@@ -151,7 +157,7 @@ _MAX_VALUES = 1_000_000
 
 @dataclass(frozen=True)
 class _Directory:
-    """Entries of the first directory: values of SHORT and LONG ones by tag."""
+    """Entries of the first directory that are used: values of SHORT and LONG ones by tag."""
 
     path: str | Path
     entries: dict[int, tuple[int, ...]]
@@ -202,7 +208,8 @@ def _directory(data: bytes, path: str | Path) -> _Directory:
         entries = {}
         for k in range(count):
             tag, kind, values = struct.unpack_from(f"{order}HHI", data, at + 2 + 12 * k)
-            if kind not in _FORMATS or not 1 <= values <= _MAX_VALUES:
+            # Of each only the first: a file may name one tag 65,535 times, with a million values each.
+            if tag not in _USED or tag in entries or kind not in _FORMATS or not 1 <= values <= _MAX_VALUES:
                 continue
             code, size = _FORMATS[kind]
             place = at + 10 + 12 * k

@@ -72,9 +72,10 @@ def _matches_plain(value: Any, hint: Any) -> bool:
     if hint is None or hint is type(None):
         return value is None
     if hint is float:
-        return isinstance(value, (int, float, np.floating, np.integer)) and not isinstance(value, bool)
+        is_number = isinstance(value, (int, float, np.floating, np.integer))
+        return is_number and not isinstance(value, bool | np.timedelta64)
     if hint is int:
-        return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+        return isinstance(value, (int, np.integer)) and not isinstance(value, bool | np.timedelta64)
     if hint is bool:
         return isinstance(value, (bool, np.bool_))
     if not isinstance(hint, type) or getattr(hint, "_is_protocol", False):

@@ -12,7 +12,7 @@ import numpy as np
 from sst_graph.config import expect_settings
 from sst_graph.drive.stamp_intervals import Jump
 from sst_graph.errors import DataError, EstimationError, one_line
-from sst_graph.factors.arguments import checked_count, checked_type
+from sst_graph.factors.arguments import checked_count, checked_type, is_whole
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.floating_point import with_usual_errors
 from sst_graph.marginal import inverse
@@ -382,6 +382,6 @@ class Tracker:
                 self._restart(Restart(self._near, 0, why), 0)
                 why = f"{why}; the calibration is estimated again"
         stamp_ns = data.stamp_ns if isinstance(data, Scan | CameraImage) else 0
-        known = isinstance(stamp_ns, int | np.integer) and abs(int(stamp_ns)) <= LATEST_NS
+        known = is_whole(stamp_ns) and abs(int(stamp_ns)) <= LATEST_NS
         update = make_update(self, int(stamp_ns) if known else 0, why, sensor=sensor)
         return dataclasses.replace(update, refused=(sensor,))

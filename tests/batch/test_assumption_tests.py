@@ -92,7 +92,7 @@ def test_what_cannot_be_tested_is_considered_and_said() -> None:
     found = calibrate_prepared(prepare_drives([street], CONFIG), street.nominal, CONFIG)
     report = found.diagnostics["assumptions"]
     assert "estimate" not in report["cx"] and report["cx"]["sigma"] > 10.0 * CONFIG.assumptions.cx
-    assert any("too few matches to test focal, cx" in remark for remark in found.diagnostics["remarks"])
+    assert any("too few matches to test focal, cx" in remark for remark in found.reasons)
 
 
 @pytest.mark.slow

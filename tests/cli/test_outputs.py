@@ -14,7 +14,7 @@ import pytest
 from calibrations import turned
 
 from sst_graph.cli import main
-from sst_graph.cli.messages import loudness
+from sst_graph.cli.messages import complain, loudness
 from sst_graph.cli.outputs import why_not_ok
 from sst_graph.result import read_result
 from sst_graph.simulator import SimulationConfig, simulate, write_drive
@@ -298,3 +298,9 @@ def test_where_further_reasons_stand(monkeypatch: pytest.MonkeyPatch) -> None:
     assert why_not_ok(many) == "not_converged: reason 0 (7 more in the report)"
     monkeypatch.setattr(loudness, "quiet", True)
     assert why_not_ok(result) == "not_converged: one (1 more in the report)"
+
+
+def test_remarks_are_one_printable_line(capsys: pytest.CaptureFixture[str]) -> None:
+    """What a calibration.json holds is repeated in them."""
+    complain("note: read with --cloud \x1b[31m\nx, as é was made")
+    assert capsys.readouterr().err == "sst-graph: note: read with --cloud \\x1b[31m x, as é was made\n"

@@ -143,6 +143,33 @@ def test_what_others_write_meanwhile_is_passed_on(capfd: pytest.CaptureFixture[s
     assert capfd.readouterr().err == "somebody else\n"
 
 
+def test_a_check_of_opencv_that_fails_is_no_line_of_ours(capfd: pytest.CaptureFixture[str]) -> None:
+    said = "> too large (expected: 'a < B'), where\n>     'a' is 4\n> must be less than\n>     'B' is 3\n"
+    with decoder_output() as lines:
+        os.write(2, said.encode())
+    assert len(lines) == 4 and capfd.readouterr().err == ""
+
+
+def test_a_tiff_file_of_many_long_entries_takes_no_memory(tmp_path: Path) -> None:
+    path, count = tmp_path / "a.tif", 2000
+    entries = b"".join(struct.pack("<HHII", 300 + k, 4, 100_000, 24_100) for k in range(count))
+    path.write_bytes((b"II*\0" + struct.pack("<IH", 8, count) + entries).ljust(500_000, b"\1"))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(DataError, match="1 channel of 1 bits"):
+        picture_size(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000  # kB
+
+
+def test_a_jpeg_file_of_many_scans_is_not_decoded(tmp_path: Path) -> None:
+    """60,000 empty ones of a large picture would take minutes."""
+    path, empty = tmp_path / "a.jpg", b"\xff\xda\0\x08\1\1\0\1\5\0\0\0"
+    path.write_bytes(PROGRESSIVE[:-2] + 60_000 * empty + b"\xff\xd9")
+    with pytest.raises(DataError, match="scans of one JPEG picture, expected less than 100"):
+        read_picture(path)
+    path.write_bytes(PROGRESSIVE)
+    assert read_picture(path).shape == (HEIGHT, WIDTH, 3)
+
+
 def test_more_than_a_pipe_holds_does_not_block(capfd: pytest.CaptureFixture[str]) -> None:
     with decoder_output() as lines:
         for _ in range(20_000):

@@ -556,3 +556,16 @@ def test_labels_that_are_missing_on_one_side_are_named(side: str, running: Path,
     # With labels again, all is well.
     assert [tracker.add(frame).reason for frame in frames[30:33]][-1] == ""
     assert tracker.inputs.window.lacking_labels() == ""
+
+
+@pytest.mark.parametrize("unit", ["s", "ns"])
+def test_a_stamp_that_is_a_duration_of_numpy(running: Path, frames: list[Frame], unit: str) -> None:
+    """To NumPy it is a whole number, which Python does not convert."""
+    tracker, scan, image = Tracker.load(running), frames[14].scan, frames[14].image
+    assert scan is not None and image is not None
+    stamp: Any = np.timedelta64(1, unit)
+    frame = Frame(14, dataclasses.replace(scan, stamp_ns=stamp), dataclasses.replace(image, stamp_ns=stamp))
+    update = tracker.add(frame)
+    assert set(update.refused) == {"image", "scan"}
+    with pytest.raises(SstGraphError, match="fx of PinholeCamera: found"):
+        PinholeCamera(stamp, 1.0, 1.0, 1.0, 8, 6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import struct
 import weakref
 from collections import deque
@@ -28,6 +29,8 @@ _SAME = {"tf/msg/tfMessage": TF_MESSAGE, **dict.fromkeys(OLDER_CUSTOM, CUSTOM)}
 """Names that messages have in older bags; those of transforms in bags of the first versions of ROS 1."""
 
 _LONGEST_PROFILE = 256
+_NO_PLACE = (errno.EINVAL, errno.EOVERFLOW)
+"""What the system says where a damaged index points before or far behind the file."""
 _KEPT = 8
 """Messages that are kept of those read last: image, mask and scan of one instant stand side by side."""
 _SKIPPED_AT_MOST = 16
@@ -141,9 +144,12 @@ class Bag:
                 message = Message(topic, received_ns, last.occurrence + 1 if last and again else 0)
                 seen[topic] = message
                 yield message, bytes(data)
-        except (SstGraphError, OSError):
+        except SstGraphError:
             raise
         except Exception as error:
+            # The disk's errors stay what they are; a place in the file that is none is the bag's own.
+            if isinstance(error, OSError) and error.errno not in _NO_PLACE:
+                raise
             raise _unreadable(self.path, error) from error
 
     def read(self, message: Message, among: frozenset[str], times_ns: NDArray[np.int64]) -> bytes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import struct
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -28,6 +29,8 @@ from sst_graph.types import SemanticClass
 CAMERA = PinholeCamera(30.0, 30.0, 16.0, 12.0, 32, 24)
 MAKE = Messages()
 PIXELS = np.full((24, 32, 3), 60, np.uint8)
+CHUNK_INDEX = 8
+"""Opcode of a record of MCAP."""
 
 
 def cloud(stamp_ns: int, make: Messages = MAKE) -> Any:
@@ -400,3 +403,15 @@ def test_without_rosbags_the_message_says_what_to_install(
     monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
     with pytest.raises(MissingDependencyError, match=r"pip install 'sst-graph\[ros\]'"):
         open_source(path)
+
+
+def test_an_index_that_points_far_behind_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (file,) = files_of(made(tmp_path, fill), ".mcap")
+    data = bytearray(file.read_bytes())
+    (summary,) = struct.unpack_from("<Q", data, len(data) - 8 - 4 - 16)
+    while data[summary] != CHUNK_INDEX:
+        summary += 9 + struct.unpack_from("<Q", data, summary + 1)[0]
+    struct.pack_into("<Q", data, summary + 9 + 16, 2**63 - 40)  # start of the chunk
+    file.write_bytes(data)
+    line = refused(capsys, file)
+    assert "cannot be read" in line and str(file) in line
