@@ -29,6 +29,9 @@ ObjectName = tuple[SemanticClass, int]
 _HORIZONS_S = (0.1, 0.3)
 """Time between the scans that are compared: the shorter finds fast objects before the next one takes their
 place, the longer slow ones [s]."""
+_OLDEST_S = 1.1
+"""Oldest scan that stands for the longer time where scans are farther apart than that, as key frames at 2 Hz
+are [s]."""
 _REACH_M, _REACH_RATIO = 0.2, 0.008
 """Farthest from its place that a point counts as found again [m], or this fraction of its range where that is
 more, for beams diverge."""
@@ -79,9 +82,10 @@ class OccupancyTest:
     def _insert(self, number: int, scan: ScanFeatures, wTl: gtsam.Pose3) -> _Places:
         """Keep the places of a scan's objects for the scans that follow."""
         self._places[number] = places = _Places.of(scan, wTl)
-        # No later scan is compared with one that is older.
+        # No later scan is compared with one that is older, but for the last one where scans are far apart.
         since = scan.stamp_ns - round(1.5e9 * max(_HORIZONS_S))
-        self._places = {k: kept for k, kept in self._places.items() if kept.stamp_ns >= since}
+        last = [*self._places][-2:]
+        self._places = {k: kept for k, kept in self._places.items() if kept.stamp_ns >= since or k in last}
         return places
 
     def forget(self, before: int) -> None:
@@ -103,9 +107,12 @@ class OccupancyTest:
         return {name: _speed(share) for name, share in least.items() if share < _STATIC_SHARE}
 
     def _nearest(self, number: int, stamp_ns: int, seconds: float) -> int | None:
-        """The earlier scan whose age is nearest to some seconds, from 0.7 to 1.5 times as much."""
+        """The earlier scan whose age is nearest to some seconds, from 0.7 to 1.5 times as much; for the
+        longest time an older one where there is none."""
         ages = {k: 1e-9 * (stamp_ns - kept.stamp_ns) for k, kept in self._places.items() if k != number}
         near = {k: abs(age - seconds) for k, age in ages.items() if 0.7 * seconds <= age <= 1.5 * seconds}
+        if not near and seconds == max(_HORIZONS_S):
+            near = {k: age for k, age in ages.items() if seconds < age <= _OLDEST_S}
         return min(near, key=near.__getitem__) if near else None
 
     def _set(self, number: int, horizon: int, found: dict[ObjectName, float]) -> None:
