@@ -104,7 +104,9 @@ def _linked(points: FloatArray, raised: NDArray[np.bool_], beams: Beams) -> tupl
         ring = beams.ring[along] + up
         a = along[ring < len(beams.elevation)]
         ring = beams.ring[a] + up
-        place = Beams.nearest(keys, Beams.key(ring, beams.azimuth[a]))
+        wanted = Beams.key(ring, beams.azimuth[a])
+        place = np.clip(np.searchsorted(keys, wanted), 1, len(keys) - 1)
+        place = np.where(keys[place] - wanted < wanted - keys[place - 1], place, place - 1)
         # Rings of some scanners come in close pairs, which tell nothing of the distance of others.
         usual = up * float(np.median(np.diff(beams.elevation)))
         gap = np.maximum(beams.elevation[ring] - beams.elevation[beams.ring[a]], usual)

@@ -86,12 +86,6 @@ class Beams:
         """Where a ring and an azimuth [rad] stand among ``keys``."""
         return np.asarray(ring * _APART + azimuth)
 
-    @staticmethod
-    def nearest(keys: FloatArray, wanted: FloatArray) -> IntArray:
-        """(m,) places of the keys (n,), two or more that rise, nearest to the wanted ones (m,)."""
-        place = np.clip(np.searchsorted(keys, wanted), 1, len(keys) - 1)
-        return np.where(keys[place] - wanted < wanted - keys[place - 1], place, place - 1)
-
 
 def arrange_beams(points: FloatArray, rings: NDArray[np.integer] | None) -> Beams:
     """Order points (n, 3) [m] by laser and azimuth and fit the cones.

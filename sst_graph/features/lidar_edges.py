@@ -359,7 +359,8 @@ def _ground_below(levels: FloatArray, objects: IntArray) -> _Ground:
 def _nearest_in_ring(beams: Beams, index: IntArray, ring: IntArray) -> tuple[IntArray, NDArray[np.bool_]]:
     """The point of a ring nearest in azimuth to each of ``index``, and whether it is within a step or so."""
     keys, wanted = beams.keys, Beams.key(ring, beams.azimuth[index])
-    place = Beams.nearest(keys, wanted)
+    place = np.clip(np.searchsorted(keys, wanted), 1, len(keys) - 1)
+    place = np.where(keys[place] - wanted < wanted - keys[place - 1], place, place - 1)
     found = beams.order[place]
     return found, (beams.ring[found] == ring) & (np.abs(keys[place] - wanted) < beams.step)
 
