@@ -92,8 +92,6 @@ def _linked(points: FloatArray, raised: NDArray[np.bool_], beams: Beams) -> tupl
     pairs, columns = [], np.ascontiguousarray(points.T)
     order, some = beams.order, np.flatnonzero(raised[beams.order])
     along = order[some]
-    if len(along) < 2:
-        return along[:0], along[:0]
     for ahead in range(1, _AHEAD + 1):
         a, b = along[:-ahead], along[ahead:]
         limit = np.maximum(_APART_M, _APART_STEPS * beams.step * beams.rho[a])
@@ -104,14 +102,12 @@ def _linked(points: FloatArray, raised: NDArray[np.bool_], beams: Beams) -> tupl
         ring = beams.ring[along] + up
         a = along[ring < len(beams.elevation)]
         ring = beams.ring[a] + up
-        wanted = Beams.key(ring, beams.azimuth[a])
-        place = np.clip(np.searchsorted(keys, wanted), 1, len(keys) - 1)
-        place = np.where(keys[place] - wanted < wanted - keys[place - 1], place, place - 1)
+        place = np.searchsorted(keys, Beams.key(ring, beams.azimuth[a]))
         # Rings of some scanners come in close pairs, which tell nothing of the distance of others.
         usual = up * float(np.median(np.diff(beams.elevation)))
         gap = np.maximum(beams.elevation[ring] - beams.elevation[beams.ring[a]], usual)
         limit = np.maximum(_APART_M, _APART_UP_STEPS * gap * beams.rho[a])
-        b = along[place]
+        b = along[np.minimum(place, len(along) - 1)]
         pairs.append(_near(columns, a, b, beams.ring[b] == ring, limit))
     return np.concatenate([a for a, _ in pairs]), np.concatenate([b for _, b in pairs])
 

@@ -54,19 +54,6 @@ def test_a_box_and_a_pole_on_sloping_ground(slope: float) -> None:
     assert (found.kinds[found.numbers][heights < 0.1] == ObjectShape.GROUND).all()
 
 
-@pytest.mark.parametrize("steps", [0.3, -0.3])
-def test_a_pole_of_one_return_a_ring_whichever_way_its_azimuths_go(steps: float) -> None:
-    """Lasers fire one after the other: they see a thin pole under azimuths that rise, or fall."""
-    points, rings = ring_scan()
-    above = np.arange(36, 47)  # rings from -2 to 3 deg
-    azimuths = np.radians(20.0 + 0.2 * steps * (above - 36))
-    heights = 20.0 * np.tan(np.radians(-20.0 + 0.5 * above))
-    pole = np.column_stack([20.0 * np.cos(azimuths), 20.0 * np.sin(azimuths), heights])
-    found = find_compact_objects(np.concatenate([points, pole]), np.append(rings, above).astype(np.uint16))
-    numbers = found.numbers[len(points) :]
-    assert len(set(numbers)) == 1 and found.kinds[numbers[0]] == ObjectShape.POLE_LIKE
-
-
 def test_returns_from_below_the_road_do_not_lower_it() -> None:
     """Returns by way of puddles."""
     points, _ = ring_scan()
