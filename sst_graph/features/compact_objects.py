@@ -96,7 +96,7 @@ def _linked(points: FloatArray, raised: NDArray[np.bool_], beams: Beams) -> tupl
         a, b = along[:-ahead], along[ahead:]
         limit = np.maximum(_APART_M, _APART_STEPS * beams.step * beams.rho[a])
         pairs.append(_near(columns, a, b, beams.ring[a] == beams.ring[b], limit))
-    # Across rings: the raised point of the ring above that is nearest in azimuth.
+    # Across rings: the next raised point of the ring above, from the same azimuth on.
     keys = beams.keys[some]
     for up in range(1, min(_RINGS_UP, len(beams.elevation) - 1) + 1):
         ring = beams.ring[along] + up
