@@ -18,7 +18,15 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from .arguments import FloatArray, checked_array, checked_number, checked_positive, checked_type, described
+from .arguments import (
+    FloatArray,
+    checked_array,
+    checked_number,
+    checked_positive,
+    checked_type,
+    described,
+    is_several,
+)
 from .condensed import condense_gram, condense_root, cost_rows
 from .custom.factor import own_factor, recipe_of
 from .custom.variables import Argument, Variables, Vector, checked_key, is_key, number_or_key, pose_or_key
@@ -64,6 +72,8 @@ class GroupedBias:
     def __post_init__(self) -> None:
         expected = "a sequence of keys or of numbers"
         checked_type("biases of a GroupedBias", self.biases, (list, tuple, np.ndarray), expected)
+        if not is_several(self.biases):
+            raise FactorError("biases of a GroupedBias", described(self.biases), expected)
         for bias in self.biases:
             number_or_key("a GroupedBias", "biases", bias)
         groups = checked_array("groups of a GroupedBias", self.groups, (None,))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, TypeGuard
 
 import gtsam
@@ -38,6 +38,11 @@ def checked_several(what: str, several: Any, kind: type, one: str, all_of_them: 
     checked_type(what, several, (tuple, list), all_of_them)
     for each in several:
         checked_type(f"one of {what}", each, kind, one)
+
+
+def is_several(value: Any) -> bool:
+    """Whether ``value`` can be walked over, as an array without dimensions cannot."""
+    return isinstance(value, Iterable) and not (isinstance(value, np.ndarray) and value.ndim == 0)
 
 
 def checked_callback(what: str, value: Any, parameters: tuple[str, ...]) -> None:

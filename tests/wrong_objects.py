@@ -27,6 +27,7 @@ def _of_another(this: gtsam.CustomFactor, values: gtsam.Values, H: list[np.ndarr
 
 WRONG: dict[str, Any] = {
     "array": np.zeros(3),
+    "duration": np.timedelta64(7, "s"),
     "matrix": np.eye(4),
     "NaN points": np.full((5, 3), np.nan),
     "points of two": np.zeros((5, 2)),

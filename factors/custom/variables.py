@@ -24,6 +24,7 @@ from ..arguments import (
     checked_gtsam,
     checked_type,
     described,
+    is_several,
     is_whole,
 )
 from ..errors import FactorError
@@ -174,7 +175,7 @@ def checked_keys(factor: str, keys: Sequence[Any] | Mapping[str, Any]) -> dict[i
     """Distinct keys of a factor, with the name of the argument that each came as ('' where it has none)."""
     if isinstance(keys, Mapping):
         named = list(keys.items())
-    elif isinstance(keys, Iterable) and not isinstance(keys, str):
+    elif is_several(keys) and not isinstance(keys, str):
         named = [("", key) for key in keys]
     else:
         raise FactorError(

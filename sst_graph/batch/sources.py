@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import islice
 from typing import Any
 
-import numpy as np
-
 from sst_graph.errors import DataError
+from sst_graph.factors.arguments import is_several
 from sst_graph.types import Source
 from sst_graph.validation import checked_source, is_source
 
@@ -25,8 +24,7 @@ def as_sources(frames: Source | Sequence[Source]) -> list[Source]:
     sources: list[Any] = [frames]
     if not is_source(frames):
         # What is endless is no sequence of drives, nor is an array without dimensions.
-        several = isinstance(frames, Iterable) and not (isinstance(frames, np.ndarray) and frames.ndim == 0)
-        sources = list(islice(frames, _MOST + 1)) if several else []
+        sources = list(islice(frames, _MOST + 1)) if is_several(frames) else []
     if not sources or not all(is_source(source) for source in sources):
         found = type(frames).__name__ if not sources else f"a sequence of {type(sources[0]).__name__}"
         raise DataError("frames to calibrate", found, "a source (open_source), a slice of one, or several")

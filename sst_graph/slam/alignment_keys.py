@@ -18,6 +18,7 @@ from sst_graph.factors.arguments import (
     checked_number,
     checked_type,
     described,
+    is_several,
     is_whole,
 )
 from sst_graph.factors.custom.variables import (
@@ -61,8 +62,10 @@ class Trajectory:
             DataError: not one rising stamp for each key.
             FactorError: no keys, no stamps.
         """
-        for name, given in (("keys", keys), ("stamps_ns", stamps_ns)):
-            checked_type(f"{name} of Trajectory", given, Iterable, "one for each pose, in the order of time")
+        expected = "one for each pose, in the order of time"
+        for name, given in (("keys of Trajectory", keys), ("stamps_ns of Trajectory", stamps_ns)):
+            if not is_several(given):
+                raise FactorError(name, described(given), expected)
         self._keys: list[int] = []
         self._stamps: list[int] = []
         self._known: set[int] = set()

@@ -162,9 +162,7 @@ def last_warnings(
     interval_s = max((each.place.between.seconds for each in matches if each.place is not None), default=0.0)
     if interval_s > LONGEST_INTERVAL_S:
         detail = "add poses by odometry between the keys"
-        warnings.append(
-            TermWarning(WarningKind.LONG_INTERVAL, interval_s, LONGEST_INTERVAL_S, "s", detail)
-        )
+        warnings.append(TermWarning(WarningKind.LONG_INTERVAL, interval_s, LONGEST_INTERVAL_S, "s", detail))
     without = sum(each.factor is None for each in matches)
     if without > 0.5 * len(matches):
         warnings.append(TermWarning(WarningKind.NO_MATCHES, without, 0.5 * len(matches), "terms"))
