@@ -78,10 +78,8 @@ def robust_covariance(
         state: that the matches were made at.
         prior: what is known beside the matches, a factor of the graph.
     """
-    table, known = (
-        match_table(system, values, pairs, state, tracks),
-        information_beside(prior, system.unknowns),
-    )
+    table = match_table(system, values, pairs, state, tracks)
+    known = information_beside(prior, system.unknowns)
     return RobustCovariance(system.covariance(), system.unknowns, table, known)
 
 
