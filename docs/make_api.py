@@ -52,6 +52,8 @@ SECTIONS: dict[str, list[str]] = {
         "sst_graph.Trajectory",
         "sst_graph.follow_objects",
         "sst_graph.solve_with_terms",
+        "sst_graph.RematchConfig",
+        "sst_graph.WarningKind",
         "sst_graph.IncrementalTerms",
         "sst_graph.calibration_covariance",
         "sst_graph.align_frame",

@@ -18,10 +18,12 @@ if TYPE_CHECKING:
     from sst_graph.slam.align import CameraCalibration, FrameMatching, ScanMotion, align_frame
     from sst_graph.slam.alignment_keys import AlignmentKeys, Trajectory
     from sst_graph.slam.alignment_term import AlignmentTerm, TermConfig
+    from sst_graph.slam.config import RematchConfig
     from sst_graph.slam.covariance import calibration_covariance
     from sst_graph.slam.incremental_terms import IncrementalTerms
     from sst_graph.slam.moving_objects import follow_objects
     from sst_graph.slam.solving import solve_with_terms
+    from sst_graph.slam.term_warnings import WarningKind
     from sst_graph.tracker import Tracker, TrackerConfig, TrackUpdate
     from sst_graph.types import Calibration, CameraImage, Frame, Scan, SemanticClass, Source
 
@@ -40,6 +42,7 @@ __all__ = [
     "KnownPose",
     "KnownRig",
     "PinholeCamera",
+    "RematchConfig",
     "RigResult",
     "Scan",
     "ScanMotion",
@@ -50,6 +53,7 @@ __all__ = [
     "Tracker",
     "TrackerConfig",
     "Trajectory",
+    "WarningKind",
     "align_frame",
     "calibrate",
     "calibrate_rig",
@@ -77,6 +81,7 @@ _HOMES = {
     "KnownPose": "sst_graph.rig",
     "KnownRig": "sst_graph.rig",
     "PinholeCamera": "sst_graph.factors",
+    "RematchConfig": "sst_graph.slam.config",
     "RigResult": "sst_graph.rig",
     "Scan": "sst_graph.types",
     "ScanMotion": "sst_graph.slam.align",
@@ -87,6 +92,7 @@ _HOMES = {
     "Tracker": "sst_graph.tracker",
     "TrackerConfig": "sst_graph.tracker",
     "Trajectory": "sst_graph.slam.alignment_keys",
+    "WarningKind": "sst_graph.slam.term_warnings",
     "align_frame": "sst_graph.slam.align",
     "calibrate": "sst_graph.batch",
     "calibrate_rig": "sst_graph.rig",
