@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -197,6 +198,27 @@ def test_at_stamps_nothing_is_between() -> None:
     still = SensorPath(motions(weaving, evenly(42))).steps(starts, starts + PERIOD_NS)
     rocks = SensorPath(motions(rocking, evenly(42))).steps(starts, starts + PERIOD_NS)
     np.testing.assert_allclose(rocks.covariances, still.covariances, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("hz", "most_s"), [(1.5, 1e-5), (2.5, 5e-4), (3.1, 2e-3)])
+@pytest.mark.parametrize("fraction", [0.2, 0.8])
+def test_fast_motion_is_not_held_near_the_stamps(hz: float, most_s: float, fraction: float) -> None:
+    """The path is where the motion is at that time, and not earlier or later, at all phases of the motion."""
+
+    def angle(t: Any) -> Any:
+        return 0.002 * np.sin(2.0 * np.pi * hz * t)
+
+    def pose(t: float) -> gtsam.Pose3:
+        return gtsam.Pose3(gtsam.Rot3.Ry(angle(t)), np.zeros(3))
+
+    path = SensorPath(motions(pose, evenly(70)))
+    stamps = np.arange(5, 65) * PERIOD_NS
+    times = stamps + round(fraction * PERIOD_NS)
+    steps = path.steps(stamps, times)
+    found = angle(1e-9 * stamps) + np.array([gtsam.Rot3.Logmap(gtsam.Rot3(T[:3, :3]))[1] for T in steps.aTbs])
+    rates = (angle(1e-9 * times + 1e-5) - angle(1e-9 * times - 1e-5)) / 2e-5
+    late_s = rates @ (found - angle(1e-9 * times)) / (rates @ rates)
+    assert abs(late_s) < most_s
 
 
 @pytest.mark.parametrize(("hz", "least", "most"), [(2.5, 1.2, 2.0), (3.1, 1.0, 1.5), (3.5, 0.8, 1.2)])
