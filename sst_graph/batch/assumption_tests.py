@@ -3,13 +3,13 @@
 The problem is solved again with the parameters of all assumptions as variables, from matches far away to
 near ones: a wrong assumption moves matches beyond the last kernel, and they are found again where its
 parameter is free. Where few objects are seen, so many parameters and wide kernels may lead to another
-optimum; then it is solved from nearer matches. With those matches frozen one linear step leads to the
-estimate of one parameter while all others hold, with its cluster-robust covariance. The estimate over its
-deviation decides (Wald). What is contradicted most is solved for once more, alone and from where that step
-leads: that solution must confirm it. One that explains less of what is in view than the estimate does is
-another optimum and contradicts nothing: wide kernels lead there where few objects are seen. A solution from
-the estimate itself then tells how far the parameter is open. What is not confirmed leaves the next one to be
-tried.
+optimum; then it is solved from nearer matches. With those matches frozen one
+linear step leads to the estimate of one parameter while all others hold, with its cluster-robust covariance.
+The estimate over its deviation decides (Wald). What is contradicted most is solved for once more, alone and
+from where that step leads: that solution must confirm it. One that explains less of what is in view than the
+estimate does is another optimum and contradicts nothing: wide kernels lead there where few objects are seen.
+A solution from the estimate itself then tells how far the parameter is open. What is not confirmed leaves the
+next one to be tried.
 """
 
 from __future__ import annotations
@@ -55,10 +55,10 @@ not converge: the linear step to one parameter's estimate covers the rest.
 _NEAR_KERNELS_PX = (10.0, 7.0, 5.0, 4.0, 3.0)
 """Kernel scales of a solution that starts near its optimum [px]: with one parameter free, or with all where
 the wider kernels lead to another optimum."""
-_ANOTHER_OPTIMUM = 0.9
+_ANOTHER_OPTIMUM = 0.6
 """Share of the boundary points that the estimate explains below which a solution with more parameters free is
-at another optimum. On twelve streets of two seconds it was 0.94 to 1.02 at the same one, and below 0.3 at
-another on two."""
+at another optimum. On thirteen streets it was 0.86 to 1.02 at the same one, and below 0.3 at another on two.
+"""
 _STAGE = "assumptions"
 """Name of this stage of a calibration."""
 _MOST_AT_LAST_SCALE = 4
@@ -191,7 +191,8 @@ def _to_be_tested(config: AssumptionConfig) -> list[str]:
 
 
 def untested(findings: Sequence[ParameterTest], config: AssumptionConfig) -> tuple[str, ...]:
-    """Assumptions that were to be tested and could not be: too few matches determine their parameters."""
+    """Assumptions that were to be tested and could not be: with their parameters free there are too few
+    matches, or another optimum."""
     tested = {each.assumption.name for each in findings}
     return tuple(name for name in _to_be_tested(config) if name not in tested)
 
@@ -200,7 +201,8 @@ def untested_remark(names: Sequence[str]) -> tuple[str, ...]:
     """The remark about assumptions that could not be tested; none where all were."""
     if not names:
         return ()
-    return (f"too few matches to test {', '.join(names)}: considered as where nobody has checked the set-up",)
+    which = ", ".join(names)
+    return (f"no test of {which} by these matches: considered as where nobody has checked the set-up",)
 
 
 @dataclass(frozen=True)

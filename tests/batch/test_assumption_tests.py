@@ -13,11 +13,19 @@ from streets import crowded_street
 
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drives
-from sst_graph.batch.assumption_tests import LinearProblem, SolvedProblem, few_objects_factor
+from sst_graph.batch.assumption_tests import (
+    LinearProblem,
+    ParameterTest,
+    SolvedProblem,
+    few_objects_factor,
+    untested,
+    untested_remark,
+    with_test_results,
+)
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.config import with_overrides
 from sst_graph.covariance.cluster_robust import robust_covariance
-from sst_graph.covariance.considered import BUDGET, AssumptionConfig
+from sst_graph.covariance.considered import BUDGET, AssumptionConfig, Considered
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import ConfigError
@@ -85,14 +93,18 @@ def test_another_optimum_contradicts_nothing(seed: int) -> None:
     assert not any(entry.get("contradicted") for entry in report.values())
 
 
-@pytest.mark.slow
-def test_what_cannot_be_tested_is_considered_and_said() -> None:
-    """Three frames with few objects: no estimate of any parameter."""
-    street = simulate(SimulationConfig(seed=7102, frames=3))
-    found = calibrate_prepared(prepare_drives([street], CONFIG), street.nominal, CONFIG)
-    report = found.diagnostics["assumptions"]
-    assert "estimate" not in report["cx"] and report["cx"]["sigma"] > 10.0 * CONFIG.assumptions.cx
-    assert any("too few matches to test focal, cx" in remark for remark in found.reasons)
+def test_what_is_not_tested_is_considered_and_said() -> None:
+    config = AssumptionConfig(estimate=("k1",))
+    cx = ParameterTest.of(ASSUMPTIONS["cx"], 0.0, 0.1, config.threshold)
+    names = untested([cx], config)
+    assert {"focal", "cy", "k2"} <= set(names) and not {"cx", "k1", "sweep"} & set(names)
+    assert untested([], dataclasses.replace(config, test=False)) == () == untested_remark(())
+    (remark,) = untested_remark(names)
+    assert remark.startswith("no test of focal, cy, k2, ")
+    sigmas = {name: config.sigma(name) for name in (*names, "cx")}
+    considered = Considered({name: np.ones(7) for name in sigmas}, sigmas)
+    found = with_test_results(considered, [cx], names).sigmas
+    assert found["cy"] > 10.0 * config.cy and found["cx"] == pytest.approx(config.cx, rel=0.01)
 
 
 @pytest.mark.slow
